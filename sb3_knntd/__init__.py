@@ -1,0 +1,12 @@
+"""kNN-TD(λ) for Stable-Baselines3: a weighted k-nearest-neighbour table in place of a network."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+
+from sb3_knntd.knntd import KNNTD
+from sb3_knntd.perception import Perception
+from sb3_knntd.policies import KNNPolicy
+
+__all__ = ["KNNTD", "KNNPolicy", "Perception"]
+__version__ = version("sb3-knntd")

@@ -1,0 +1,531 @@
+"""The learning loop that every algorithm here shares, as an SB3 algorithm."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pathlib
+import sys
+import tempfile
+import time
+import zipfile
+from abc import abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, safe_mean
+
+from sb3_knntd.checks import check_number, check_schedule, check_word
+from sb3_knntd.learner import Learner, Rates, Transition
+from sb3_knntd.policies import KNNPolicy
+from sb3_knntd.random_stream import RandomStream
+from sb3_knntd.rules import ActionRule
+
+SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
+
+#: Observations from a random policy that the range of an open dimension is taken from: in all, and of each env.
+MEASURING_STEPS = 1000
+MEASURING_STEPS_PER_ENV = 100
+
+
+class KNNAlgorithm(BaseAlgorithm):
+    """
+    What the algorithms of this package share: spaces, parameters, the learning loop, saving and loading.
+
+    :param policy: ``"KNNPolicy"``, a subclass of :class:`~sb3_knntd.policies.KNNPolicy`, or, as there is
+        nothing to choose from, the environment
+    :param env: the environment (a gymnasium id, an environment, or a VecEnv)
+    :param learning_rate: α, or a function of the remaining progress (from 1 to 0)
+    :param gamma: γ, in [0, 1]
+    :param trace_decay: λ, in [0, 1], or a function of the remaining progress
+    :param n_neighbors: k >= 1, or ``"auto"``
+    :param points: ``"auto"``, an int, one int a dimension, or an array (n_points, obs_dim) in observation units
+    :param bounds: the range mapped to [-1, 1]: ``None`` or (low, high), arrays (obs_dim,) in observation units
+    :param weights: ``"inverse_quadratic"`` (eq. 5), ``"gaussian"``, or a function from squared distances
+        (batch, k) to weights (batch, k)
+    :param bandwidth: h of the weights, > 0, scaled units
+    :param search: ``"auto"``, ``"brute"``
+    :param step_size: ``"paper"`` (α as in eq. 13) or ``"normalized"`` (α / Σp², so that α is the share of the
+        TD error that one update removes)
+    :param traces: ``"replacing"`` (eq. 16) or ``"accumulating"`` (eq. 15)
+    :param reset_other_actions: whether a replacing trace clears those of the other actions (Algorithm 3, line 16)
+    :param tie_break: ``"random"`` or ``"first"``: which of several equal best actions is taken while training
+    :param initial_value: Q at the start; above what is attainable it makes the learner explore
+    :param stats_window_size: number of episodes that the logged means are over
+    :param tensorboard_log: folder for TensorBoard, ``None`` for no log
+    :param policy_kwargs: ``{"dtype": torch.float32}`` for a table of half the size
+    :param verbose: 0 for no output, 1 for information, 2 for debugging
+    :param seed: seed of all random numbers
+    :param device: where perception and table are
+    :param _init_setup_model: whether to build the table at once
+    :raises ValueError: if an argument does not fit; the message says which, and what would
+    """
+
+    policy: KNNPolicy
+    learner: Learner
+    trace_schedule: Schedule
+    exploration_schedule: Schedule
+
+    #: What an action space must be, and what to do with another.
+    _supported_action_space: ClassVar[type[spaces.Space[Any]]]
+    _action_space_advice: ClassVar[str]
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv,
+        env: GymEnv | str | None,
+        *,
+        learning_rate: float | Schedule,
+        gamma: float,
+        trace_decay: float | Schedule,
+        n_neighbors: int | str,
+        points: Any,
+        bounds: Any,
+        weights: str | Callable[[th.Tensor], Any],
+        bandwidth: float,
+        search: str,
+        step_size: str,
+        traces: str,
+        reset_other_actions: bool,
+        tie_break: str,
+        initial_value: float,
+        stats_window_size: int,
+        tensorboard_log: str | None,
+        policy_kwargs: dict[str, Any] | None,
+        verbose: int,
+        seed: int | None,
+        device: th.device | str,
+    ) -> None:
+        policy_class, env = self._sort_out(policy, env)
+        if env is not None:
+            env = maybe_make_env(env, verbose)
+            self._check_spaces(env.observation_space, env.action_space)
+        super().__init__(
+            policy_class,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+        )
+        #: Which algorithm a saved file is of.
+        self.algorithm = type(self).__name__
+        self.gamma = gamma
+        self.trace_decay = trace_decay
+        self.n_neighbors = n_neighbors
+        self.points = points
+        self.bounds = bounds
+        self.weights = weights
+        self.bandwidth = bandwidth
+        self.search = search
+        self.step_size = step_size
+        self.traces = traces
+        self.reset_other_actions = reset_other_actions
+        self.tie_break = tie_break
+        self.initial_value = initial_value
+
+        #: ε or the temperature at the last step
+        self.exploration_rate = 0.0
+        self._last_actions: np.ndarray | None = None
+        self._n_measured = 0
+
+    @abstractmethod
+    def _make_rule(self) -> ActionRule:
+        """Check the parameters of the action rule and make it."""
+
+    @abstractmethod
+    def _make_exploration_schedule(self) -> Schedule:
+        """Check the parameters of exploration and make the schedule of its rate."""
+
+    @abstractmethod
+    def _env_actions(self, actions: np.ndarray) -> np.ndarray:
+        """From the rule's actions to those of the environment, shape (n_envs, *action_shape)."""
+
+    # ----------------------------------------------------------------- set-up
+
+    @classmethod
+    def _sort_out(
+        cls, policy: str | type[BasePolicy] | GymEnv, env: GymEnv | str | None
+    ) -> tuple[type[KNNPolicy], GymEnv | str | None]:
+        """Tell policy and environment apart: either order of giving them works."""
+        call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{next(iter(cls.policy_aliases))}", env)'
+        if isinstance(policy, str) and policy in cls.policy_aliases:
+            policy = cls.policy_aliases[policy]
+        if isinstance(policy, str) and policy.endswith("Policy"):
+            raise ValueError(
+                f"{cls.__name__} has no {policy!r}: it learns a table and has no network to choose. Call {call}"
+            )
+        if isinstance(policy, type):
+            if not issubclass(policy, KNNPolicy):
+                raise ValueError(f"policy must be a KNNPolicy; got {policy.__name__}. Call {call}")
+            return policy, env
+        if env is not None:
+            raise ValueError(f"two environments were given, {policy!r} and {env!r}. Call {call}")
+        return next(iter(cls.policy_aliases.values())), policy  # type: ignore[return-value]
+
+    @classmethod
+    def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+        discrete = isinstance(observation_space, spaces.Discrete) or (
+            isinstance(observation_space, spaces.MultiDiscrete) and observation_space.nvec.ndim == 1
+        )
+        vector = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
+        if not (discrete or (vector and observation_space.shape != (0,))):
+            if isinstance(observation_space, spaces.Dict | spaces.Tuple):
+                advice = "Flatten it with gymnasium.wrappers.FlattenObservation"
+            elif isinstance(observation_space, spaces.Box) and len(observation_space.shape) >= 2:
+                advice = (
+                    "Images have too many dimensions for a table of points: extract a few features first, or use a "
+                    "network (DQN, PPO); small arrays can be flattened with gymnasium.wrappers.FlattenObservation"
+                )
+            else:
+                advice = "Map it to a Box of shape (n,) with gymnasium.wrappers.TransformObservation"
+            raise ValueError(
+                f"{cls.__name__} takes observations in a Box of shape (n,), Discrete or MultiDiscrete of one axis; "
+                f"got {observation_space}. {advice}"
+            )
+        if not isinstance(action_space, cls._supported_action_space):
+            raise ValueError(
+                f"{cls.__name__} takes actions in a {cls._supported_action_space.__name__} space; got {action_space}. "
+                f"{cls._action_space_advice}"
+            )
+
+    def _setup_model(self) -> None:
+        if not hasattr(self, "observation_space"):
+            raise ValueError(f"env must be given to build a model: {type(self).__name__}(env)")
+        self._check_parameters()
+        self._setup_lr_schedule()
+        self.trace_schedule = FloatSchedule(self.trace_decay)
+        self.exploration_schedule = self._make_exploration_schedule()
+        rule = self._make_rule()
+        normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
+        unknown = set(self.policy_kwargs) - {"dtype"}
+        if unknown:
+            raise ValueError(f"policy_kwargs takes 'dtype' only; got {', '.join(map(repr, sorted(unknown)))}")
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            n_neighbors=self.n_neighbors,
+            points=self.points,
+            bounds=self.bounds,
+            weights=self.weights,
+            bandwidth=self.bandwidth,
+            search=self.search,
+            initial_value=self.initial_value,
+            bounds_from_space=not normalizes,
+            **self.policy_kwargs,
+        ).to(self.device)
+        self.learner = Learner(
+            self.policy.perceiver,
+            self.policy.table,
+            rule,
+            self.n_envs,
+            self.gamma,
+            self.step_size == "normalized",
+            self.traces,
+            self.reset_other_actions,
+        )
+        self._rule = rule
+        self.set_random_seed(self.seed)
+
+    def _check_parameters(self) -> None:
+        check_schedule("learning_rate", self.learning_rate, 0.0)
+        check_number("gamma", self.gamma, 0.0, 1.0)
+        check_schedule("trace_decay", self.trace_decay, 0.0, 1.0)
+        check_word("step_size", self.step_size, ["paper", "normalized"])
+        check_word("traces", self.traces, ["replacing", "accumulating"])
+        check_word("tie_break", self.tie_break, ["random", "first"])
+        if not isinstance(self.reset_other_actions, (bool, np.bool_)):
+            raise ValueError(f"reset_other_actions must be True or False; got {self.reset_other_actions!r}")
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        Seed Python, NumPy, torch, the environment, the action space, and the learner's own numbers.
+
+        :param seed: the seed; ``None`` leaves all but the learner's own as they are, which start anew from the
+            operating system's entropy
+        """
+        super().set_random_seed(seed)
+        self._stream = RandomStream(seed, (self.n_envs, 2, self._rule.n_uniforms))
+
+    # --------------------------------------------------------------- learning
+
+    def learn(
+        self: SelfKNNAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "KNN",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfKNNAlgorithm:
+        """
+        Learn from ``total_timesteps`` steps in the environment, from each in the step that made it.
+
+        If a dimension of the observations has no range (infinite bounds, or VecNormalize), the first 1000
+        steps (at least 100 of each environment) act at random to find it. They count, and teach no values.
+
+        :param total_timesteps: number of environment steps, over all environments together
+        :param callback: called at every step, after it has been learned from
+        :param log_interval: number of episodes between logs, ``None`` for none
+        :param tb_log_name: name of the run in TensorBoard
+        :param reset_num_timesteps: whether to count steps from 0; if not, training goes on where it was
+        :param progress_bar: whether to show a progress bar (tqdm and rich)
+        :return: the model
+        :raises ValueError: if an environment returns an observation or reward that is not finite. The table is
+            untouched by that step
+        """
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps:
+            if not self._step(callback, log_interval):
+                break
+        callback.on_training_end()
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if self.env is None:
+            raise ValueError("there is no environment to learn from: call set_env(env) first")
+        if reset_num_timesteps or self._last_obs is None:
+            # The environments are about to be reset, and with them the episodes and the actions chosen in them.
+            self._last_actions = None
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
+        """
+        One step in every environment, and what is learned from it.
+
+        :return: whether to go on
+        """
+        env = self.env
+        assert env is not None
+        callback.on_rollout_start()
+        measuring = self._is_measuring
+        actions = self._random_actions() if measuring else self._current_actions()
+        new_obs, rewards, dones, infos = env.step(self._env_actions(actions))
+        transition = self._transition(new_obs, rewards, dones, infos)  # type: ignore[arg-type]
+
+        self.num_timesteps += env.num_envs
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        if measuring:
+            self._measure(transition)
+        else:
+            self._last_actions = self.learner.learn(transition, self._stream.next(), self._rates())
+        self._last_obs = new_obs  # type: ignore[assignment]
+
+        callback.update_locals(locals())
+        if not callback.on_step():
+            return False
+        self._update_info_buffer(infos, dones)
+        for done in dones:
+            if done:
+                self._episode_num += 1
+                if log_interval is not None and self._episode_num % log_interval == 0:
+                    self.dump_logs()
+        callback.on_rollout_end()
+        return True
+
+    def _rates(self) -> Rates:
+        progress = self._current_progress_remaining
+        self.exploration_rate = self.exploration_schedule(progress)
+        return Rates(self.lr_schedule(progress), self.trace_schedule(progress), self.exploration_rate)
+
+    def _current_actions(self) -> np.ndarray:
+        """The actions chosen in the last step, or at the start of the episodes."""
+        if self._last_actions is None:
+            assert isinstance(self._last_obs, np.ndarray)
+            self._check_finite("observation", self._last_obs)
+            self._last_actions = self.learner.begin(self._last_obs, self._stream.next()[:, 0], self._rates())
+        return self._last_actions
+
+    def _transition(
+        self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> Transition:
+        """Put together what is learned from, and refuse what is not finite before anything is changed."""
+        self._check_finite("observation", new_obs)
+        self._check_finite("reward", rewards)
+        truncated = np.zeros_like(dones)
+        last_observations = np.empty((0, *new_obs.shape[1:]), dtype=new_obs.dtype)
+        if dones.any():
+            for index in dones.nonzero()[0]:
+                info = infos[index]
+                truncated[index] = info.get("TimeLimit.truncated", False) and "terminal_observation" in info
+            if truncated.any():
+                indices = truncated.nonzero()[0]
+                last_observations = np.stack([infos[index]["terminal_observation"] for index in indices])
+                self._check_finite("terminal observation", last_observations, indices)
+        return Transition(new_obs, rewards, dones, truncated, last_observations)
+
+    def _check_finite(self, what: str, values: np.ndarray, envs: np.ndarray | None = None) -> None:
+        finite = np.isfinite(values)
+        if finite.all():
+            return
+        row, *component = np.argwhere(~finite)[0]
+        where = f", component {component[0]}," if component else ""
+        raise ValueError(
+            f"environment {row if envs is None else envs[row]} returned a {what} that is not finite{where} "
+            f"at step {self.num_timesteps + self.n_envs}: {values[row]}. The table is as it was before this step"
+        )
+
+    # -------------------------------------------- the range of open dimensions
+
+    @property
+    def _is_measuring(self) -> bool:
+        wanted = max(MEASURING_STEPS, MEASURING_STEPS_PER_ENV * self.n_envs)
+        return self._n_measured < wanted and self.policy.perceiver.bounds.is_open
+
+    def _random_actions(self) -> np.ndarray:
+        n_actions = self.policy.table.values.shape[1]
+        return (self._stream.next()[:, 0, 0] * n_actions).astype(np.int64)
+
+    def _measure(self, transition: Transition) -> None:
+        observations = np.concatenate((transition.observations, transition.last_observations))
+        self.policy.perceiver.measure(th.from_numpy(observations).to(self.device))
+        self._n_measured += self.n_envs
+        if not self._is_measuring and self.verbose >= 1:
+            bounds = self.policy.perceiver.bounds
+            ranges = ", ".join(
+                f"{dimension}: [{bounds.low[dimension]:.3g}, {bounds.high[dimension]:.3g}]"
+                for dimension in bounds.open.nonzero()[:, 0].tolist()
+            )
+            print(f"Range measured over {self._n_measured} random steps, by observation dimension: {ranges}")
+
+    # ---------------------------------------------------------------- logging
+
+    def dump_logs(self) -> None:
+        """Write the log, under SB3's keys and the learner's own."""
+        assert self.ep_info_buffer is not None
+        assert self.ep_success_buffer is not None
+        elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
+        record = self.logger.record
+        record("time/episodes", self._episode_num, exclude="tensorboard")
+        record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
+        record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        if len(self.ep_info_buffer) > 0:
+            record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
+            record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
+        if len(self.ep_success_buffer) > 0:
+            record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        for key, value in self.learner.summary().items():
+            record(f"train/{key}", value)
+        record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
+        record("train/exploration_rate", self.exploration_rate)
+        record("train/visited_points", int(self.policy.table.visited.sum()))
+        self.logger.dump(step=self.num_timesteps)
+
+    # ------------------------------------------------------ saving and loading
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_rule", "_stream"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "learner"], []
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save everything to a zip file, table, traces, random state and counters. It is written beside the old
+        file and renamed, so that whatever interrupts it leaves a whole file.
+
+        :param path: file, with ``.zip`` added if it has no suffix, or file-like object
+        :param exclude: attributes to leave out besides SB3's
+        :param include: attributes to save although SB3 leaves them out
+        """
+        self._stream_state = self._stream.state()
+        if not isinstance(path, (str, pathlib.Path)):
+            super().save(path, exclude, include)
+            return
+        target = pathlib.Path(path)
+        if not target.suffix:
+            target = target.with_name(f"{target.name}.zip")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, beside = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                super().save(file, exclude, include)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(beside, target)
+        except BaseException:
+            pathlib.Path(beside).unlink(missing_ok=True)
+            raise
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfKNNAlgorithm],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "cpu",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfKNNAlgorithm:
+        """
+        Load a model from a zip file.
+
+        :param path: file, or file-like object
+        :param env: environment to go on with; ``None`` to predict only. Its number may differ from the saved
+        :param device: where perception and table are to be
+        :param custom_objects: objects to take in place of those in the file
+        :param print_system_info: whether to print the system it was saved on
+        :param force_reset: whether ``learn`` starts new episodes; ``False`` goes on in the middle of the saved
+            ones, for an environment that is in the state it was in
+        :param kwargs: attributes to change
+        :return: the model
+        :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has
+        """
+        saved_as = _algorithm_of(path)
+        if saved_as != cls.__name__:
+            raise ValueError(f"{path} holds a model of {saved_as}, not of {cls.__name__}: load it with its own class")
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        model._stream.set_state(model._stream_state)
+        return model
+
+
+def _algorithm_of(path: str | pathlib.Path | io.BufferedIOBase) -> str:
+    """Name of the algorithm that saved a file, read without unpickling anything."""
+    file: Any = path
+    if isinstance(path, (str, pathlib.Path)):
+        candidates = [pathlib.Path(path), pathlib.Path(f"{path}.zip")]
+        file = next((candidate for candidate in candidates if candidate.is_file()), None)
+        if file is None:
+            raise FileNotFoundError(f"no such file: {candidates[0]} (nor {candidates[1]})")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            damaged = archive.testzip()
+            if damaged is not None:
+                raise ValueError(f"{path} is damaged: {damaged} in it is not what was written")
+            data = json.loads(archive.read("data"))
+    except (zipfile.BadZipFile, KeyError, json.JSONDecodeError, EOFError) as error:
+        raise ValueError(f"{path} is no saved model, or was cut off: {error}") from error
+    finally:
+        if not isinstance(path, (str, pathlib.Path)):
+            path.seek(0)
+    return str(data.get("algorithm", "another algorithm"))

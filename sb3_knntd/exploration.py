@@ -1,0 +1,88 @@
+"""From action values to an action: greedy choice, ties and exploration."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+import torch as th
+
+
+def greedy(values: th.Tensor, ranks: th.Tensor | None = None) -> th.Tensor:
+    """
+    The best action of each row.
+
+    :param values: shape (..., n_actions)
+    :param ranks: uniform random numbers in [0, 1), shape (...), which of several equal best actions to take;
+        the first if not given
+    :return: shape (...), int64
+    """
+    best = values == values.amax(dim=-1, keepdim=True)
+    if ranks is None:
+        return best.int().argmax(dim=-1)
+    count = best.cumsum(dim=-1)
+    return (count == 1 + pick(ranks, count[..., -1])[..., None]).int().argmax(dim=-1)
+
+
+def pick(uniforms: th.Tensor, n: th.Tensor | int) -> th.Tensor:
+    """
+    :param uniforms: random numbers in [0, 1)
+    :param n: how many there are to pick from, at least 1
+    :return: integers in [0, n), as likely as each other, the shape of ``uniforms``
+    """
+    # The product can round up to n itself.
+    return (uniforms * n).long().clamp(max=n - 1) if isinstance(n, int) else th.minimum((uniforms * n).long(), n - 1)
+
+
+class Exploration(Protocol):
+    """A stochastic policy over action values. ``rate`` is ε or the temperature."""
+
+    #: uniform random numbers an action takes
+    N_UNIFORMS: ClassVar[int]
+
+    def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
+        """
+        :param values: action values, shape (batch, n_actions)
+        :param uniforms: random numbers in [0, 1), shape (batch, N_UNIFORMS)
+        :param rate: ε or the temperature
+        :param random_ties: whether equal best actions are drawn from; the first is taken otherwise
+        :return: actions, shape (batch,), int64
+        """
+        ...
+
+    def expectation(self, values: th.Tensor, rate: float) -> th.Tensor:
+        """
+        :param values: action values, shape (batch, n_actions)
+        :param rate: ε or the temperature
+        :return: the mean value under this policy, shape (batch,)
+        """
+        ...
+
+
+class EpsilonGreedy:
+    """A uniformly random action with probability ε, else the best."""
+
+    N_UNIFORMS: ClassVar[int] = 2
+
+    def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
+        best = greedy(values, uniforms[:, 1] if random_ties else None)
+        return th.where(uniforms[:, 0] < rate, pick(uniforms[:, 1], values.shape[-1]), best)
+
+    def expectation(self, values: th.Tensor, rate: float) -> th.Tensor:
+        return (1.0 - rate) * values.amax(dim=-1) + rate * values.mean(dim=-1)
+
+
+class Softmax:
+    """An action with probability proportional to exp(Q / temperature)."""
+
+    N_UNIFORMS: ClassVar[int] = 1
+
+    def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
+        shares = th.softmax(values / rate, dim=-1).cumsum(dim=-1)
+        # Scaled by the last sum, which rounding may leave short of 1.
+        return (uniforms[:, :1] * shares[:, -1:] >= shares).sum(dim=-1).clamp(max=values.shape[-1] - 1)
+
+    def expectation(self, values: th.Tensor, rate: float) -> th.Tensor:
+        return (th.softmax(values / rate, dim=-1) * values).sum(dim=-1)
+
+
+EXPLORATIONS: dict[str, type[EpsilonGreedy] | type[Softmax]] = {"epsilon_greedy": EpsilonGreedy, "softmax": Softmax}

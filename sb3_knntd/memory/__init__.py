@@ -1,0 +1,8 @@
+"""What is it worth? The Q-table and its eligibility traces."""
+
+from __future__ import annotations
+
+from sb3_knntd.memory.table import QTable
+from sb3_knntd.memory.traces import Traces
+
+__all__ = ["QTable", "Traces"]

@@ -1,0 +1,135 @@
+"""The range of observations that is mapped to [-1, 1]."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+#: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
+LARGEST_SENSIBLE_BOUND = 1e10
+#: A measured range is widened by this share on either side, since a better policy sees more than a random one.
+MARGIN = 0.1
+
+
+class Bounds(nn.Module):
+    """
+    Affine map of each observation dimension onto [-1, 1] (eq. 4 of the paper). Values outside are not clipped.
+
+    A dimension whose bounds are infinite, larger than 1e10 or empty (low >= high) is *open*: it stands at
+    [-1, 1] until :meth:`measure` has seen observations, then at their range, widened by a tenth on either side.
+
+    :param low: lower bounds, shape (obs_dim,), observation units
+    :param high: upper bounds, shape (obs_dim,), observation units
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+    open: th.Tensor
+    seen_low: th.Tensor
+    seen_high: th.Tensor
+
+    def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
+        super().__init__()
+        low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        sensible = (np.abs(low) <= LARGEST_SENSIBLE_BOUND) & (np.abs(high) <= LARGEST_SENSIBLE_BOUND) & (low < high)
+        self.register_buffer("low", th.from_numpy(np.where(sensible, low, -1.0)))
+        self.register_buffer("high", th.from_numpy(np.where(sensible, high, 1.0)))
+        self.register_buffer("open", th.from_numpy(~sensible))
+        self.register_buffer("seen_low", th.full_like(self.low, th.inf))
+        self.register_buffer("seen_high", th.full_like(self.low, -th.inf))
+
+    @property
+    def obs_dim(self) -> int:
+        """Number of observation dimensions."""
+        return len(self.low)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether some dimension has no range of its own and has to be measured."""
+        return bool(self.open.any())
+
+    def measure(self, observations: th.Tensor) -> None:
+        """
+        Widen the range of the open dimensions to take in these observations.
+
+        :param observations: shape (batch, obs_dim), finite
+        """
+        self.seen_low.copy_(th.minimum(self.seen_low, observations.amin(dim=0)))
+        self.seen_high.copy_(th.maximum(self.seen_high, observations.amax(dim=0)))
+        width = self.seen_high - self.seen_low
+        # A dimension that has not moved yet gets a range of one unit on either side.
+        margin = th.where(width > 0, MARGIN * width, 1.0)
+        self.low.copy_(th.where(self.open, self.seen_low - margin, self.low))
+        self.high.copy_(th.where(self.open, self.seen_high + margin, self.high))
+
+    def scale(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: shape (..., obs_dim), observation units
+        :return: the same in scaled units, [-1, 1] within the bounds (eq. 4)
+        """
+        return 2.0 * ((observations - self.low) / (self.high - self.low)) - 1.0
+
+    def unscale(self, scaled: th.Tensor) -> th.Tensor:
+        """
+        :param scaled: shape (..., obs_dim), scaled units
+        :return: the same in observation units
+        """
+        return self.low + 0.5 * (scaled + 1.0) * (self.high - self.low)
+
+
+def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space: bool = True) -> Bounds:
+    """
+    :param bounds: ``None`` for the space's own, or a pair (low, high) of arrays of shape (obs_dim,)
+        in observation units
+    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param from_space: whether the space tells the range; with VecNormalize around the environment it does
+        not, and all dimensions are open unless ``bounds`` are given
+    :return: the bounds
+    :raises ValueError: if ``bounds`` has another form, is not finite, or low >= high somewhere
+    """
+    low, high = _bounds_of(observation_space)
+    if bounds is None:
+        return Bounds(low, high) if from_space else Bounds(np.full_like(low, -np.inf), np.full_like(high, np.inf))
+    if not isinstance(observation_space, spaces.Box):
+        raise ValueError(
+            f"bounds must be None for a {type(observation_space).__name__} observation space, whose states are "
+            f"the points; got {bounds!r}"
+        )
+    try:
+        given_low, given_high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"bounds must be None or a pair (low, high) of arrays; got {bounds!r}") from error
+    for name, given in (("low", given_low), ("high", given_high)):
+        if given.shape != low.shape:
+            raise ValueError(
+                f"bounds: {name} must have shape {low.shape}, one number for each observation dimension; "
+                f"got shape {given.shape}"
+            )
+        if not np.all(np.abs(given) <= LARGEST_SENSIBLE_BOUND):
+            raise ValueError(
+                f"bounds: {name} must be finite and at most {LARGEST_SENSIBLE_BOUND:g} in size; got {given}"
+            )
+    if not np.all(given_low < given_high):
+        dimension = int(np.argmax(given_low >= given_high))
+        raise ValueError(
+            f"bounds: low must be below high in every dimension; in dimension {dimension} low is "
+            f"{given_low[dimension]:g} and high is {given_high[dimension]:g}"
+        )
+    return Bounds(given_low, given_high)
+
+
+def _bounds_of(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
+    if isinstance(observation_space, spaces.Box):
+        return observation_space.low.astype(np.float64), observation_space.high.astype(np.float64)
+    if isinstance(observation_space, spaces.Discrete):
+        first, counts = np.array([observation_space.start]), np.array([observation_space.n])
+    elif isinstance(observation_space, spaces.MultiDiscrete):
+        first, counts = observation_space.start, observation_space.nvec
+    else:
+        raise TypeError(f"no bounds are defined for {observation_space}")
+    # A dimension with a single state has no width; any width will do for its single point.
+    return first.astype(np.float64), (first + np.maximum(counts - 1, 1)).astype(np.float64)

@@ -1,0 +1,69 @@
+"""Where am I? From an observation to a distribution over its nearest points."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch as th
+from torch import nn
+
+from sb3_knntd.perception.bounds import Bounds
+from sb3_knntd.perception.points import Points
+from sb3_knntd.perception.search import Search
+from sb3_knntd.perception.weights import Weights
+
+
+class Perception(NamedTuple):
+    """
+    What an observation is to the learner (eqs. 5 and 6 of the paper).
+
+    :param indices: the k nearest points, nearest first, shape (batch, k), int64
+    :param probabilities: how much each counts, rows sum to 1, shape (batch, k), float64
+    """
+
+    indices: th.Tensor
+    probabilities: th.Tensor
+
+
+class Perceiver(nn.Module):
+    """
+    Observation -> Bounds -> Search -> Weights -> Perception.
+
+    :param bounds: the range that is mapped to [-1, 1]
+    :param points: the points
+    :param search: finds the neighbours among ``points``
+    :param weights: weighs them by distance
+    """
+
+    def __init__(self, bounds: Bounds, points: Points, search: Search, weights: Weights) -> None:
+        super().__init__()
+        self.bounds = bounds
+        self.points = points
+        self.search = search
+        self.weights = weights
+        self.fit()
+
+    def fit(self) -> None:
+        """Bring the search up to date with the bounds and their device."""
+        self.search.fit(self.bounds)
+
+    def measure(self, observations: th.Tensor) -> None:
+        """
+        Widen the bounds of the open dimensions to take in these observations.
+
+        :param observations: shape (batch, *obs_shape), any number type
+        """
+        self.bounds.measure(self._flat(observations))
+        self.fit()
+
+    def forward(self, observations: th.Tensor) -> Perception:
+        """
+        :param observations: shape (batch, *obs_shape), any number type, observation units
+        :return: their perceptions
+        """
+        indices, squared_distances = self.search.query(self.bounds.scale(self._flat(observations)))
+        weights = self.weights(squared_distances)
+        return Perception(indices, weights / weights.sum(dim=1, keepdim=True))
+
+    def _flat(self, observations: th.Tensor) -> th.Tensor:
+        return observations.reshape(-1, self.bounds.obs_dim).to(self.bounds.low)

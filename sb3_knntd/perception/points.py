@@ -1,0 +1,120 @@
+"""The perception points: where the table has its rows."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_knntd.checks import check_integer
+from sb3_knntd.perception.bounds import Bounds
+
+#: ``points="auto"``: a lattice of about this many points in all, with at most so many in a dimension.
+AUTO_POINTS = 4096
+AUTO_POINTS_PER_DIMENSION = 20
+
+
+class Points(ABC):
+    """A set of points, numbered from 0, at fixed places."""
+
+    #: number of points
+    n_points: int
+    #: number of observation dimensions
+    obs_dim: int
+
+    @abstractmethod
+    def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param bounds: the range that is mapped to [-1, 1]
+        :param indices: which points, shape (n,), int64; all of them if not given
+        :return: their places in scaled units, shape (n, obs_dim), float64
+        """
+
+
+class Lattice(Points):
+    """
+    A regular lattice over [-1, 1] in every scaled dimension, end points included, numbered in C order
+    (the last dimension runs fastest). Only its axes are kept in memory. One point in a dimension sits in
+    the middle of it.
+
+    :param shape: number of points in each dimension
+    """
+
+    def __init__(self, shape: Sequence[int]) -> None:
+        self.shape = tuple(shape)
+        self.obs_dim = len(self.shape)
+        self.n_points = math.prod(self.shape)
+        self.axes = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in self.shape]
+
+    def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
+        device = bounds.low.device
+        rest = th.arange(self.n_points, device=device) if indices is None else indices
+        columns = []
+        for axis in reversed(self.axes):
+            columns.append(th.from_numpy(axis).to(device)[rest % len(axis)])
+            rest = rest // len(axis)
+        return th.stack(columns[::-1], dim=1)
+
+
+class Scattered(Points):
+    """
+    Points at given places.
+
+    :param places: shape (n_points, obs_dim), observation units
+    """
+
+    def __init__(self, places: np.ndarray) -> None:
+        self.places = np.array(places, dtype=np.float64)
+        self.n_points, self.obs_dim = self.places.shape
+
+    def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
+        places = th.from_numpy(self.places).to(bounds.low.device)
+        return bounds.scale(places if indices is None else places[indices])
+
+
+def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
+    """
+    :param points: ``"auto"``, an int (points in every dimension), one int a dimension, or an array of
+        shape (n_points, obs_dim) in observation units
+    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :return: the points; for Discrete and MultiDiscrete one a state
+    :raises ValueError: if ``points`` does not fit the space
+    """
+    if isinstance(observation_space, spaces.Discrete | spaces.MultiDiscrete):
+        if not (isinstance(points, str) and points == "auto"):
+            raise ValueError(
+                f"points must be 'auto' for a {type(observation_space).__name__} observation space, which has one "
+                f"point a state; got {points!r}"
+            )
+        return Lattice(np.atleast_1d(getattr(observation_space, "nvec", getattr(observation_space, "n", 0))).tolist())
+
+    assert observation_space.shape is not None
+    obs_dim = observation_space.shape[0]
+    if isinstance(points, str):
+        if points != "auto":
+            raise ValueError(f"points must be 'auto', an int, one int a dimension, or an array; got {points!r}")
+        per_dimension = min(AUTO_POINTS_PER_DIMENSION, max(2, round(AUTO_POINTS ** (1 / obs_dim))))
+        return Lattice((per_dimension,) * obs_dim)
+
+    array = np.asarray(points)
+    if array.ndim == 0:
+        return Lattice((check_integer("points", points, 1),) * obs_dim)
+    if array.ndim == 1:
+        if len(array) != obs_dim:
+            raise ValueError(
+                f"points: one int for each of the {obs_dim} observation dimensions is needed; got {len(array)}: "
+                f"{points!r} (scattered points are an array of shape (n_points, {obs_dim}))"
+            )
+        return Lattice([check_integer("points", count, 1) for count in array.tolist()])
+    if array.ndim != 2 or array.shape[1] != obs_dim or len(array) == 0:
+        raise ValueError(
+            f"points: scattered points must be an array of shape (n_points, {obs_dim}); got shape {array.shape}"
+        )
+    if not np.issubdtype(array.dtype, np.number) or not np.all(np.isfinite(array)):
+        raise ValueError("points: scattered points must be finite numbers; got NaN, infinity or something else")
+    return Scattered(array)

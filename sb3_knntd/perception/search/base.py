@@ -1,0 +1,52 @@
+"""What every neighbour search does."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch as th
+
+from sb3_knntd.perception.bounds import Bounds
+from sb3_knntd.perception.points import Points
+
+
+class Neighbors(NamedTuple):
+    """
+    The k nearest points of each observation, by distance and, at equal distance, by index.
+
+    :param indices: shape (batch, k), int64
+    :param squared_distances: shape (batch, k), float64, scaled units
+    """
+
+    indices: th.Tensor
+    squared_distances: th.Tensor
+
+
+class Search(ABC):
+    """
+    Exact k-nearest-neighbour search in scaled units. Squared distances are summed over the dimensions in
+    their order, and ties go to the lower index, so that every search gives the same answer.
+
+    :param points: the points
+    :param n_neighbors: k
+    """
+
+    def __init__(self, points: Points, n_neighbors: int) -> None:
+        self.points = points
+        self.n_neighbors = n_neighbors
+
+    @abstractmethod
+    def fit(self, bounds: Bounds) -> None:
+        """
+        Take in the places of the points; called again whenever the bounds have moved.
+
+        :param bounds: the range that is mapped to [-1, 1]
+        """
+
+    @abstractmethod
+    def query(self, scaled: th.Tensor) -> Neighbors:
+        """
+        :param scaled: observations in scaled units, shape (batch, obs_dim), float64
+        :return: their neighbours
+        """

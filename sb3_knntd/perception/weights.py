@@ -1,0 +1,108 @@
+"""How much each neighbour counts, by its distance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch as th
+
+from sb3_knntd.checks import check_number, check_word
+
+
+class Weights(Protocol):
+    """From squared distances (batch, k), in scaled units and rising along k, to weights (batch, k)."""
+
+    def __call__(self, squared_distances: th.Tensor, /) -> th.Tensor: ...
+
+
+class InverseQuadratic:
+    """
+    w = 1 / (1 + d²/h²); with h = 1 eq. 5 of the paper.
+
+    :param bandwidth: h, scaled units
+    """
+
+    def __init__(self, bandwidth: float = 1.0) -> None:
+        self.bandwidth = float(bandwidth)
+
+    def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
+        return 1.0 / (1.0 + squared_distances / (self.bandwidth * self.bandwidth))
+
+
+class Gaussian:
+    """
+    w = exp(-d² / 2h²), times a constant of each row that the normalisation takes out again: the nearest
+    neighbour has weight 1, so that an observation far outside the points still has a perception.
+
+    :param bandwidth: h, scaled units
+    """
+
+    def __init__(self, bandwidth: float = 1.0) -> None:
+        self.bandwidth = float(bandwidth)
+
+    def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
+        excess = squared_distances - squared_distances[:, :1]
+        return th.exp(-excess / (2.0 * (self.bandwidth * self.bandwidth)))
+
+
+class Custom:
+    """
+    A user's function, whose every answer is checked.
+
+    :param function: from squared distances (batch, k) to weights (batch, k)
+    """
+
+    def __init__(self, function: Callable[[th.Tensor], Any]) -> None:
+        self.function = function
+
+    def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
+        weights = th.as_tensor(self.function(squared_distances), dtype=th.float64, device=squared_distances.device)
+        if weights.shape != squared_distances.shape:
+            raise ValueError(
+                f"weights: the function must return an array of the shape it is given, "
+                f"{tuple(squared_distances.shape)}; got {tuple(weights.shape)}"
+            )
+        fault = _fault(weights)
+        if fault:
+            raise ValueError(
+                f"weights: the function must return finite numbers >= 0, not all zero in a row; it returned {fault} "
+                f"for the squared distances {squared_distances[~_is_proper(weights)][0].tolist()}"
+            )
+        return weights
+
+
+_BUILT_IN = {"inverse_quadratic": InverseQuadratic, "gaussian": Gaussian}
+
+
+def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
+    """
+    :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k)
+        in scaled units to weights (batch, k)
+    :param bandwidth: h, scaled units; has no meaning for a function
+    :param n_neighbors: k, for the trial of a function
+    :return: the weights
+    :raises ValueError: if the word is unknown, h is not positive, or the function returns NaN, infinity,
+        negative or all-zero weights for distances as they occur
+    """
+    check_number("bandwidth", bandwidth, 0.0, above=True)
+    if not callable(weights):
+        check_word("weights", weights, _BUILT_IN)
+        return _BUILT_IN[weights](bandwidth)
+    custom = Custom(weights)
+    # From an observation on top of a point to one at the far corner of a four-dimensional box.
+    reach = th.linspace(0.0, 1.0, n_neighbors, dtype=th.float64)
+    custom(th.stack([scale * reach + offset for scale, offset in ((0.0, 0.0), (0.1, 0.0), (1.0, 0.01), (4.0, 12.0))]))
+    return custom
+
+
+def _is_proper(weights: th.Tensor) -> th.Tensor:
+    return (th.isfinite(weights) & (weights >= 0)).all(dim=1) & (weights.sum(dim=1) > 0)
+
+
+def _fault(weights: th.Tensor) -> str:
+    if _is_proper(weights).all():
+        return ""
+    if not th.isfinite(weights).all():
+        return "NaN or infinity"
+    return "negative weights" if (weights < 0).any() else "only zeros"

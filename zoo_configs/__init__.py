@@ -1,0 +1,1 @@
+"""RL Zoo configurations for the algorithms of this package."""
