@@ -24,16 +24,20 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, safe_mean
 
 from sb3_knntd.checks import check_number, check_schedule, check_word
-from sb3_knntd.learner import Learner, Rates, Transition
+from sb3_knntd.compiled_learner import CompiledLearner
+from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, Transition, check_transition
+from sb3_knntd.memory import DenseTable
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
-from sb3_knntd.rules import ActionRule
+from sb3_knntd.rules import ActionRule, DiscreteRule
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
 #: Observations from a random policy that the range of an open dimension is taken from: in all, and of each env.
 MEASURING_STEPS = 1000
 MEASURING_STEPS_PER_ENV = 100
+
+NOTHING = np.empty(0)
 
 
 class KNNAlgorithm(BaseAlgorithm):
@@ -140,6 +144,7 @@ class KNNAlgorithm(BaseAlgorithm):
         self.exploration_rate = 0.0
         self._last_actions: np.ndarray | None = None
         self._n_measured = 0
+        self._measuring = False
 
     @abstractmethod
     def _make_rule(self) -> ActionRule:
@@ -210,9 +215,11 @@ class KNNAlgorithm(BaseAlgorithm):
         self.exploration_schedule = self._make_exploration_schedule()
         rule = self._make_rule()
         normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
-        unknown = set(self.policy_kwargs) - {"dtype"}
+        unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
         if unknown:
-            raise ValueError(f"policy_kwargs takes 'dtype' only; got {', '.join(map(repr, sorted(unknown)))}")
+            raise ValueError(
+                f"policy_kwargs takes 'dtype', 'table' and 'compiled'; got {', '.join(map(repr, sorted(unknown)))}"
+            )
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
             self.action_space,
@@ -227,18 +234,20 @@ class KNNAlgorithm(BaseAlgorithm):
             bounds_from_space=not normalizes,
             **self.policy_kwargs,
         ).to(self.device)
-        self.learner = Learner(
-            self.policy.perceiver,
-            self.policy.table,
-            rule,
-            self.n_envs,
-            self.gamma,
-            self.step_size == "normalized",
-            self.traces,
-            self.reset_other_actions,
+        form = Form(
+            self.gamma, self.step_size == "normalized", self.traces == "accumulating", bool(self.reset_other_actions)
         )
+        self.learner = self._make_learner(rule, form)
         self._rule = rule
         self.set_random_seed(self.seed)
+
+    def _make_learner(self, rule: ActionRule, form: Form) -> Learner:
+        perceiver, table = self.policy.perceiver, self.policy.table
+        if self.policy.is_compiled:
+            assert isinstance(rule, DiscreteRule)
+            return CompiledLearner(perceiver, table, rule, self.n_envs, form)
+        assert isinstance(table, DenseTable)
+        return TorchLearner(perceiver, table, rule, self.n_envs, form)
 
     def _check_parameters(self) -> None:
         check_schedule("learning_rate", self.learning_rate, 0.0)
@@ -290,6 +299,7 @@ class KNNAlgorithm(BaseAlgorithm):
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self._measuring = self._must_measure()
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             if not self._step(callback, log_interval):
@@ -321,28 +331,30 @@ class KNNAlgorithm(BaseAlgorithm):
         env = self.env
         assert env is not None
         callback.on_rollout_start()
-        measuring = self._is_measuring
-        actions = self._random_actions() if measuring else self._current_actions()
+        actions = self._random_actions() if self._measuring else self._current_actions()
         new_obs, rewards, dones, infos = env.step(self._env_actions(actions))
         transition = self._transition(new_obs, rewards, dones, infos)  # type: ignore[arg-type]
-
+        n_before = self.num_timesteps
         self.num_timesteps += env.num_envs
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-        if measuring:
-            self._measure(transition)
-        else:
-            self._last_actions = self.learner.learn(transition, self._stream.next(), self._rates())
+        try:
+            if self._measuring:
+                self._measure(transition)
+            else:
+                self._last_actions = self.learner.learn(transition, self._stream.next(), self._rates())
+        except (ValueError, FloatingPointError) as error:
+            step, self.num_timesteps = self.num_timesteps, n_before
+            raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
         self._last_obs = new_obs  # type: ignore[assignment]
 
         callback.update_locals(locals())
         if not callback.on_step():
             return False
         self._update_info_buffer(infos, dones)
-        for done in dones:
-            if done:
-                self._episode_num += 1
-                if log_interval is not None and self._episode_num % log_interval == 0:
-                    self.dump_logs()
+        for _ in range(np.count_nonzero(dones)):
+            self._episode_num += 1
+            if log_interval is not None and self._episode_num % log_interval == 0:
+                self.dump_logs()
         callback.on_rollout_end()
         return True
 
@@ -355,55 +367,42 @@ class KNNAlgorithm(BaseAlgorithm):
         """The actions chosen in the last step, or at the start of the episodes."""
         if self._last_actions is None:
             assert isinstance(self._last_obs, np.ndarray)
-            self._check_finite("observation", self._last_obs)
             self._last_actions = self.learner.begin(self._last_obs, self._stream.next()[:, 0], self._rates())
         return self._last_actions
 
     def _transition(
         self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> Transition:
-        """Put together what is learned from, and refuse what is not finite before anything is changed."""
-        self._check_finite("observation", new_obs)
-        self._check_finite("reward", rewards)
-        truncated = np.zeros_like(dones)
-        last_observations = np.empty((0, *new_obs.shape[1:]), dtype=new_obs.dtype)
-        if dones.any():
-            for index in dones.nonzero()[0]:
-                info = infos[index]
-                truncated[index] = info.get("TimeLimit.truncated", False) and "terminal_observation" in info
-            if truncated.any():
-                indices = truncated.nonzero()[0]
-                last_observations = np.stack([infos[index]["terminal_observation"] for index in indices])
-                self._check_finite("terminal observation", last_observations, indices)
+        """Put together what is learned from."""
+        truncated = [
+            index
+            for index, done in enumerate(dones.tolist())
+            if done and infos[index].get("TimeLimit.truncated", False) and "terminal_observation" in infos[index]
+        ]
+        if not truncated:
+            return Transition(new_obs, rewards, dones, truncated, NOTHING)
+        last_observations = np.array([infos[index]["terminal_observation"] for index in truncated])
         return Transition(new_obs, rewards, dones, truncated, last_observations)
-
-    def _check_finite(self, what: str, values: np.ndarray, envs: np.ndarray | None = None) -> None:
-        finite = np.isfinite(values)
-        if finite.all():
-            return
-        row, *component = np.argwhere(~finite)[0]
-        where = f", component {component[0]}," if component else ""
-        raise ValueError(
-            f"environment {row if envs is None else envs[row]} returned a {what} that is not finite{where} "
-            f"at step {self.num_timesteps + self.n_envs}: {values[row]}. The table is as it was before this step"
-        )
 
     # -------------------------------------------- the range of open dimensions
 
-    @property
-    def _is_measuring(self) -> bool:
+    def _must_measure(self) -> bool:
         wanted = max(MEASURING_STEPS, MEASURING_STEPS_PER_ENV * self.n_envs)
         return self._n_measured < wanted and self.policy.perceiver.bounds.is_open
 
     def _random_actions(self) -> np.ndarray:
-        n_actions = self.policy.table.values.shape[1]
+        n_actions = self.policy.table.n_actions
         return (self._stream.next()[:, 0, 0] * n_actions).astype(np.int64)
 
     def _measure(self, transition: Transition) -> None:
-        observations = np.concatenate((transition.observations, transition.last_observations))
+        check_transition(transition)
+        observations = transition.observations
+        if transition.truncated:
+            observations = np.concatenate((observations, transition.last_observations))
         self.policy.perceiver.measure(th.from_numpy(observations).to(self.device))
         self._n_measured += self.n_envs
-        if not self._is_measuring and self.verbose >= 1:
+        self._measuring = self._must_measure()
+        if not self._measuring and self.verbose >= 1:
             bounds = self.policy.perceiver.bounds
             ranges = ", ".join(
                 f"{dimension}: [{bounds.low[dimension]:.3g}, {bounds.high[dimension]:.3g}]"
@@ -432,7 +431,7 @@ class KNNAlgorithm(BaseAlgorithm):
             record(f"train/{key}", value)
         record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
         record("train/exploration_rate", self.exploration_rate)
-        record("train/visited_points", int(self.policy.table.visited.sum()))
+        record("train/visited_points", self.policy.table.n_visited)
         self.logger.dump(step=self.num_timesteps)
 
     # ------------------------------------------------------ saving and loading
@@ -477,7 +476,7 @@ class KNNAlgorithm(BaseAlgorithm):
             raise
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(
         cls: type[SelfKNNAlgorithm],
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,

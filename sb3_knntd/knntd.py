@@ -26,9 +26,9 @@ class KNNTD(KNNAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "KNNPolicy",
         env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = 0.3,
+        learning_rate: float | Schedule = LinearSchedule(0.5, 0.05, 1.0),  # noqa: B008
         gamma: float = 0.99,
-        trace_decay: float | Schedule = 0.95,
+        trace_decay: float | Schedule = 0.9,
         n_neighbors: int | str = "auto",
         points: Any = "auto",
         bounds: Any = None,
@@ -37,10 +37,10 @@ class KNNTD(KNNAlgorithm):
         search: str = "auto",
         step_size: str = "normalized",
         traces: str = "replacing",
-        reset_other_actions: bool = True,
+        reset_other_actions: bool = False,
         target: str = "sarsa",
         exploration: str = "epsilon_greedy",
-        exploration_initial_eps: float = 0.1,
+        exploration_initial_eps: float = 0.3,
         exploration_final_eps: float = 0.0,
         exploration_fraction: float = 0.5,
         temperature: float | Schedule = 1.0,
@@ -110,7 +110,8 @@ class KNNTD(KNNAlgorithm):
 
     def _env_actions(self, actions: np.ndarray) -> np.ndarray:
         assert isinstance(self.action_space, spaces.Discrete)
-        return actions + self.action_space.start
+        start = self.action_space.start
+        return actions + start if start else actions
 
     def learn(
         self: SelfKNNTD,
@@ -121,6 +122,4 @@ class KNNTD(KNNAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfKNNTD:
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-        )
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from torch import nn
 
-from sb3_knntd.memory import QTable, Traces
+from sb3_knntd.memory import DenseTable, Traces
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.rules import ActionRule, Choice
 
@@ -20,15 +21,14 @@ class Transition(NamedTuple):
     :param observations: what each sees now (after a reset where an episode ended), shape (n_envs, *obs_shape)
     :param rewards: shape (n_envs,)
     :param ended: whether the episode ended, shape (n_envs,), bool
-    :param truncated: whether it ended by a time limit, shape (n_envs,), bool
-    :param last_observations: the true last observation of each truncated environment, in the order of
-        the environments, shape (truncated.sum(), *obs_shape)
+    :param truncated: the environments whose episode ended by a time limit, rising
+    :param last_observations: the true last observation of each of these, shape (len(truncated), *obs_shape)
     """
 
     observations: np.ndarray
     rewards: np.ndarray
     ended: np.ndarray
-    truncated: np.ndarray
+    truncated: list[int]
     last_observations: np.ndarray
 
 
@@ -46,50 +46,31 @@ class Rates(NamedTuple):
     exploration: float
 
 
-class Learner(nn.Module):
+class Form(NamedTuple):
     """
-    Algorithms 1 to 3 of the paper as torch operations on any device, batched over environments. Between
-    calls it holds the state of each episode: perception and choice at the current observation, and traces.
+    Which of the update's forms.
 
-    :param perceiver: where am I?
-    :param table: what is it worth?
-    :param rule: what do I do?
-    :param n_envs: number of environments
     :param gamma: γ
     :param normalized: whether the step is α / Σp² in place of α
-    :param traces: ``"replacing"`` or ``"accumulating"``
-    :param reset_other_actions: see :class:`~sb3_knntd.memory.Traces`
+    :param accumulating: whether traces accumulate (eq. 15) in place of being replaced (eq. 16)
+    :param reset_other_actions: whether a replacing trace clears those of the other actions
     """
 
-    indices: th.Tensor
-    probabilities: th.Tensor
-    entries: th.Tensor
+    gamma: float
+    normalized: bool
+    accumulating: bool
+    reset_other_actions: bool
 
-    def __init__(
-        self,
-        perceiver: Perceiver,
-        table: QTable,
-        rule: ActionRule,
-        n_envs: int,
-        gamma: float,
-        normalized: bool,
-        traces: str,
-        reset_other_actions: bool,
-    ) -> None:
-        super().__init__()
-        # Belonging to the policy, which saves them: kept out of this module's own state.
-        self._parts = (perceiver, table, rule)
-        self.n_envs = n_envs
-        self.gamma = gamma
-        self.normalized = normalized
-        self.traces = Traces(table, n_envs, traces, reset_other_actions)
-        shape, values = (n_envs, perceiver.search.n_neighbors), table.values
-        self.register_buffer("indices", th.zeros(shape, dtype=th.int64, device=values.device))
-        self.register_buffer("probabilities", values.new_zeros(shape))
-        self.register_buffer("entries", th.zeros(shape, dtype=th.int64, device=values.device))
-        self._sums = values.new_zeros(2)
-        self._n_sums = 0
 
+class Learner(ABC):
+    """
+    Algorithms 1 to 3 of the paper, for several environments in step. Between calls it holds where each episode
+    is: perception and choice at the current observation, and traces.
+    """
+
+    n_envs: int
+
+    @abstractmethod
     def begin(self, observations: np.ndarray, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
         """
         Start an episode in every environment.
@@ -98,11 +79,10 @@ class Learner(nn.Module):
         :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
         :param rates: the scheduled parameters
         :return: index of the action to take in each environment, shape (n_envs,), int64
+        :raises ValueError: if an observation is not finite
         """
-        self.traces.clear()
-        perception, choice = self._choose(observations, uniforms, rates)
-        return self._settle_in(perception, choice)
 
+    @abstractmethod
     def learn(self, transition: Transition, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
         """
         Learn from what the last actions led to, and choose the next.
@@ -112,35 +92,123 @@ class Learner(nn.Module):
             the one that would have been taken at a truncation
         :param rates: the scheduled parameters
         :return: index of the action to take in each environment, shape (n_envs,), int64
+        :raises ValueError: if an observation or reward is not finite; nothing has been changed then
+        :raises FloatingPointError: if the values have diverged; nothing has been changed then
         """
-        table = self._parts[1]
-        perception, choice = self._choose(transition.observations, uniforms[:, 0], rates)
-        worth = choice.values
-        if transition.truncated.any():
-            _, last = self._choose(transition.last_observations, uniforms[transition.truncated, 1], rates)
-            worth = worth.index_put((self._tensor(transition.truncated),), last.values)
 
-        ended = self._tensor(transition.ended)
-        bootstraps = self._tensor(~transition.ended | transition.truncated)
-        target = self._tensor(transition.rewards).to(worth.dtype) + self.gamma * worth * bootstraps
-        value = self._value()
-        errors = target - value
-        step = rates.learning_rate
-        corrections = step * errors / self.probabilities.square().sum(dim=1) if self.normalized else step * errors
-
-        self.traces.mark(self.indices, self.entries, self.probabilities)
-        self.traces.credit(table, corrections)
-        self.traces.decay(self.gamma * rates.trace_decay, ended)
-        table.visited[self.indices] = True
-        self._sums += th.stack((errors.abs().sum(), value.sum()))
-        self._n_sums += self.n_envs
-        return self._settle_in(perception, choice)
-
+    @abstractmethod
     def summary(self) -> dict[str, float]:
         """
         :return: ``td_error``, the mean absolute TD error, and ``q_mean``, the mean value of the states and
             actions learned from, both since the last call; empty if nothing was learned
         """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: tensors and numbers; the same keys for every learner
+        """
+
+    @abstractmethod
+    def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
+        """
+        Take over the state of a learner of the same table. One of another number of environments holds no
+        episode of these, and is left.
+
+        :param state_dict: what :meth:`state_dict` returned
+        :param strict: part of torch's signature; a state is always taken whole
+        """
+
+
+def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
+    """
+    :param what: what the values are
+    :param values: a row for each of ``envs``
+    :param envs: the environments that returned them
+    :raises ValueError: if a value is not finite; the message says where
+    """
+    finite = np.isfinite(values)
+    if not finite.all():
+        row, *component = np.argwhere(~finite)[0].tolist()
+        where = f" in component {component[0]}" if component else ""
+        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
+
+
+def check_transition(transition: Transition) -> None:
+    """
+    :param transition: what the environments answered
+    :raises ValueError: if an observation or reward is not finite; the message says where
+    """
+    everyone = range(len(transition.ended))
+    check_finite("an observation", transition.observations, everyone)
+    check_finite("a reward", transition.rewards, everyone)
+    check_finite("a last observation", transition.last_observations, transition.truncated)
+
+
+DIVERGENCE = (
+    "the action values have diverged and are no longer finite: lower learning_rate, or trace_decay, or use "
+    "step_size='normalized' and gamma < 1"
+)
+
+
+class TorchLearner(Learner):
+    """
+    The step as torch operations on any device, with traces as the equations have them: the reference.
+
+    :param perceiver: where am I?
+    :param table: what is it worth?
+    :param rule: what do I do?
+    :param n_envs: number of environments
+    :param form: which of the update's forms
+    """
+
+    def __init__(self, perceiver: Perceiver, table: DenseTable, rule: ActionRule, n_envs: int, form: Form) -> None:
+        self.perceiver = perceiver
+        self.table = table
+        self.rule = rule
+        self.n_envs = n_envs
+        self.form = form
+        kind = "accumulating" if form.accumulating else "replacing"
+        self.traces = Traces(table, n_envs, kind, form.reset_other_actions)
+        shape, values = (n_envs, perceiver.search.n_neighbors), table.values
+        self.indices = th.zeros(shape, dtype=th.int64, device=values.device)
+        self.probabilities = values.new_zeros(shape)
+        self.entries = th.zeros(shape, dtype=th.int64, device=values.device)
+        self._sums = values.new_zeros(2)
+        self._n_sums = 0
+
+    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
+        check_finite("an observation", observations, range(self.n_envs))
+        self.traces.clear()
+        perception, choice = self._choose(observations, uniforms, rates)
+        return self._settle_in(perception, choice)
+
+    def learn(self, transition: Transition, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
+        check_transition(transition)
+        perception, choice = self._choose(transition.observations, uniforms[:, 0], rates)
+        worth = choice.values * self._tensor(~transition.ended)
+        if transition.truncated:
+            _, last = self._choose(transition.last_observations, uniforms[transition.truncated, 1], rates)
+            worth[transition.truncated] = last.values
+
+        value = self._value()
+        errors = self._tensor(transition.rewards).to(worth.dtype) + self.form.gamma * worth - value
+        corrections = rates.learning_rate * errors
+        if self.form.normalized:
+            corrections = corrections / self.probabilities.square().sum(dim=1)
+        # On an accelerator looking would mean waiting for it.
+        if corrections.is_cpu and not th.isfinite(corrections).all():
+            raise FloatingPointError(DIVERGENCE)
+
+        self.traces.mark(self.indices, self.entries, self.probabilities)
+        self.traces.credit(corrections)
+        self.traces.decay(self.form.gamma * rates.trace_decay, self._tensor(transition.ended))
+        self.table.visited[self.indices] = True
+        self._sums += th.stack((errors.abs().sum(), value.sum()))
+        self._n_sums += self.n_envs
+        return self._settle_in(perception, choice)
+
+    def summary(self) -> dict[str, float]:
         if not self._n_sums:
             return {}
         td_error, q_mean = (self._sums / self._n_sums).tolist()
@@ -148,24 +216,32 @@ class Learner(nn.Module):
         self._n_sums = 0
         return {"td_error": td_error, "q_mean": q_mean}
 
-    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over a saved state; one of another number of environments holds no episode of these."""
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "indices": self.indices.cpu(),
+            "probabilities": self.probabilities.double().cpu(),
+            "entries": self.entries.cpu(),
+            "traces": self.traces.state(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
+        self.traces.clear()
         if len(state_dict["indices"]) != self.n_envs:
-            self.traces.clear()
-            return None
-        return super().load_state_dict(state_dict, strict, assign)
+            return
+        for name in ("indices", "probabilities", "entries"):
+            getattr(self, name).copy_(state_dict[name])
+        self.traces.set_state(state_dict["traces"])
 
     def _choose(self, observations: np.ndarray, uniforms: np.ndarray, rates: Rates) -> tuple[Perception, Choice]:
-        perceiver, table, rule = self._parts
-        perception = perceiver(self._tensor(observations))
-        probabilities = perception.probabilities.to(table.values.dtype)
-        rows = table.rows(perception.indices)
-        choice = rule.choose(rows, probabilities, self._tensor(uniforms), rates.exploration)
+        perception = self.perceiver(self._tensor(observations))
+        probabilities = perception.probabilities.to(self.table.values.dtype)
+        rows = self.table.rows(perception.indices)
+        choice = self.rule.choose(rows, probabilities, self._tensor(uniforms), rates.exploration)
         return Perception(perception.indices, probabilities), choice
 
     def _value(self) -> th.Tensor:
         """Q(s, a) at the state and action that each environment is leaving, shape (n_envs,)."""
-        taken = self._parts[1].rows(self.indices).gather(2, self.entries[..., None])[..., 0]
+        taken = self.table.rows(self.indices).gather(2, self.entries[..., None])[..., 0]
         return (self.probabilities * taken).sum(dim=1)
 
     def _settle_in(self, perception: Perception, choice: Choice) -> np.ndarray:

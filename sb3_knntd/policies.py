@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -12,13 +13,18 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_knntd.checks import check_integer, check_number, check_word
-from sb3_knntd.memory import QTable
-from sb3_knntd.perception import Perceiver, Perception, make_bounds, make_points, make_weights
+from sb3_knntd.exploration import greedy
+from sb3_knntd.kernels import jit
+from sb3_knntd.kernels.perceive import FOUND
+from sb3_knntd.kernels.step import best_actions
+from sb3_knntd.memory import DenseTable, HashedTable, QTable
+from sb3_knntd.perception import Lattice, Perceiver, Perception, Points, make_bounds, make_points, make_weights
 from sb3_knntd.perception.search import make_search
-from sb3_knntd.rules import greedy, mean_rows
+from sb3_knntd.perception.weights import KernelWeights
+from sb3_knntd.rules import mean_rows
 
-#: ``n_neighbors="auto"``: so many for each observation dimension, as far as there are points.
-AUTO_NEIGHBORS_PER_DIMENSION = 4
+#: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
+DENSE_TABLE_BYTES = 2**28
 
 
 class KNNPolicy(BasePolicy):
@@ -28,7 +34,8 @@ class KNNPolicy(BasePolicy):
     :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
     :param action_space: Discrete
     :param lr_schedule: not used, there is nothing to optimise; part of SB3's signature
-    :param n_neighbors: k, or ``"auto"``: 4 for each observation dimension, 1 for Discrete and MultiDiscrete
+    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for Discrete and
+        MultiDiscrete
     :param points: ``"auto"``, an int, one int a dimension, or an array (n_points, obs_dim) in observation units
     :param bounds: ``None`` or (low, high), arrays of shape (obs_dim,) in observation units
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
@@ -37,6 +44,10 @@ class KNNPolicy(BasePolicy):
     :param search: how neighbours are found
     :param initial_value: what every entry of the table is at the start
     :param dtype: floating type of the table, ``torch.float64`` or ``torch.float32``
+    :param table: ``"dense"`` (a row for every point), ``"hashed"`` (a row for every point visited, for lattices
+        larger than memory, on the CPU), or ``"auto"``: dense up to 256 MiB
+    :param compiled: whether to use the compiled step where it can be used: on the CPU, with numba, and with
+        weights that are no function
     :param bounds_from_space: whether the observation space tells the range of the observations
     :raises ValueError: if an argument does not fit; the message says which, and what would
     """
@@ -54,6 +65,8 @@ class KNNPolicy(BasePolicy):
         search: str = "auto",
         initial_value: float = 0.0,
         dtype: th.dtype = th.float64,
+        table: str = "auto",
+        compiled: bool = True,
         bounds_from_space: bool = True,
     ) -> None:
         super().__init__(observation_space, action_space)
@@ -69,6 +82,8 @@ class KNNPolicy(BasePolicy):
             "search": search,
             "initial_value": initial_value,
             "dtype": dtype,
+            "table": table,
+            "compiled": compiled,
             "bounds_from_space": bounds_from_space,
         }
         places = make_points(points, observation_space)
@@ -79,7 +94,31 @@ class KNNPolicy(BasePolicy):
             make_search(search, places, self.n_neighbors),
             make_weights(weights, bandwidth, self.n_neighbors),
         )
-        self.table = QTable(places.n_points, self._count_actions(), initial_value, dtype)
+        self._compilable = compiled and jit.AVAILABLE and isinstance(self.perceiver.weights, KernelWeights)
+        if compiled and not jit.AVAILABLE:
+            warnings.warn(
+                f"numba cannot be used ({jit.REASON}): learning goes by torch operations, slower", stacklevel=2
+            )
+        self.table = self._make_table(table, places, self._count_actions(), initial_value, dtype)
+
+    def _make_table(self, table: str, places: Points, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
+        check_word("policy_kwargs: table", table, ["auto", "dense", "hashed"])
+        if table == "auto":
+            fits = places.n_points * n_actions * dtype.itemsize <= DENSE_TABLE_BYTES
+            table = "dense" if fits or not isinstance(places, Lattice) else "hashed"
+        if table == "dense":
+            return DenseTable(places.n_points, n_actions, initial_value, dtype)
+        if not self._compilable:
+            raise ValueError(
+                f"points: a table of {places.n_points} points needs the compiled step, which works on the CPU with "
+                "numba and with weights that are no function. Give fewer points, or policy_kwargs={'table': 'dense'}"
+            )
+        return HashedTable(n_actions, initial_value, dtype)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the compiled step is used."""
+        return self._compilable and self.device.type == "cpu"
 
     def _count_actions(self) -> int:
         assert isinstance(self.action_space, spaces.Discrete)
@@ -93,30 +132,76 @@ class KNNPolicy(BasePolicy):
     @property
     def points(self) -> th.Tensor:
         """
-        The perception points, shape (n_points, obs_dim), observation units. Until ``learn`` has measured
-        them, dimensions without a range of their own stand at [-1, 1].
+        The perception points, shape (n_points, obs_dim), observation units; with a hashed table those that
+        have been visited. Until ``learn`` has measured them, dimensions without a range of their own stand at
+        [-1, 1].
         """
         bounds = self.perceiver.bounds
-        return bounds.unscale(self.perceiver.points.coordinates(bounds))
+        return bounds.unscale(self.perceiver.points.coordinates(bounds, self.table.points()))
 
     @property
     def q_table(self) -> th.Tensor:
-        """The action values at the points, shape (n_points, n_actions)."""
-        return self.table.values
+        """
+        The action values at :attr:`points`, shape (n_points, n_actions). To set values while episodes go on use
+        ``set_parameters``.
+        """
+        return self.table.entries()
 
     def perceive(self, observation: np.ndarray | th.Tensor) -> Perception:
         """
         :param observation: one observation, or a batch, observation units
         :return: its nearest points and how much each counts; one row for a single observation
         """
-        return self._perceive(self.obs_to_tensor(_to_numpy(observation))[0])
+        return self._perceive(self._to_tensor(observation))
 
     def q_values(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         """
         :param observation: one observation, or a batch, observation units
         :return: Q(s, ·) = Σ p(i) Q(i, ·) (eq. 8), shape (batch, n_actions)
         """
-        return mean_rows(*self._rows(self.obs_to_tensor(_to_numpy(observation))[0]))
+        return mean_rows(*self._rows(self._to_tensor(observation)))
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The table's recommendation, ties to the lowest action.
+
+        :param observation: one observation, or a batch, observation units
+        :param state: handed back, a table has none
+        :param episode_start: has no effect
+        :param deterministic: has no effect: no chance is involved
+        :return: action, or a batch of them, and ``state``
+        """
+        shape = self.observation_space.shape or ()
+        if not self.is_compiled or not isinstance(observation, np.ndarray):
+            return super().predict(observation, state, episode_start, deterministic)
+        batch = observation.shape[: observation.ndim - len(shape)]
+        if len(batch) > 1 or (*batch, *shape) != observation.shape:
+            return super().predict(observation, state, episode_start, deterministic)
+        return self._best_actions(observation.reshape(-1, self.perceiver.bounds.obs_dim)).reshape(batch), state
+
+    def _best_actions(self, observations: np.ndarray) -> np.ndarray:
+        assert isinstance(self.action_space, spaces.Discrete)
+        if not np.isfinite(observations).all():
+            raise ValueError(f"observation must be finite; got {observations.tolist()}")
+        n, k = len(observations), self.n_neighbors
+        eyes = self.perceiver.kernel_arguments()
+        if eyes[3] == FOUND:
+            neighbors = self.perceiver.find(th.from_numpy(observations))
+            indices, probabilities = neighbors.indices.numpy(), neighbors.squared_distances.numpy()
+        else:
+            indices, probabilities = np.empty((n, k), np.int64), np.empty((n, k))
+        actions = np.empty(n, np.int64)
+        self.table.sync()
+        values, _, _, row_slots, initial = self.table.arrays()
+        seen = observations.astype(np.float64)
+        best_actions(seen, eyes, indices, probabilities, values, row_slots, initial, actions)
+        return actions + int(self.action_space.start)
 
     def forward(self, observation: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
@@ -130,6 +215,12 @@ class KNNPolicy(BasePolicy):
         assert isinstance(observation, th.Tensor)
         assert isinstance(self.action_space, spaces.Discrete)
         return greedy(mean_rows(*self._rows(observation))) + int(self.action_space.start)
+
+    def _to_tensor(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
+        array = observation.cpu().numpy() if isinstance(observation, th.Tensor) else np.asarray(observation)
+        tensor, _ = self.obs_to_tensor(array)
+        assert isinstance(tensor, th.Tensor)
+        return tensor
 
     def _perceive(self, observations: th.Tensor) -> Perception:
         if not th.isfinite(observations).all():
@@ -164,20 +255,16 @@ def _count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_p
     exact = not isinstance(observation_space, spaces.Box)
     if isinstance(n_neighbors, str):
         check_word("n_neighbors", n_neighbors, ["auto"])
-        return 1 if exact else min(AUTO_NEIGHBORS_PER_DIMENSION * obs_dim, n_points)
-    n_neighbors = check_integer("n_neighbors", n_neighbors, 1)
-    if exact and n_neighbors != 1:
+        return 1 if exact else min(2 * obs_dim + 1, n_points)
+    k = check_integer("n_neighbors", n_neighbors, 1)
+    if exact and k != 1:
         raise ValueError(
             f"n_neighbors must be 1 or 'auto' for a {type(observation_space).__name__} observation space, whose "
-            f"states have no neighbours; got {n_neighbors}"
+            f"states have no neighbours; got {k}"
         )
-    if n_neighbors > n_points:
+    if k > n_points:
         raise ValueError(
-            f"n_neighbors must be at most the number of points, {n_points}; got {n_neighbors}. "
+            f"n_neighbors must be at most the number of points, {n_points}; got {k}. "
             "Give fewer neighbours or more points"
         )
-    return n_neighbors
-
-
-def _to_numpy(observation: np.ndarray | th.Tensor) -> np.ndarray:
-    return observation.cpu().numpy() if isinstance(observation, th.Tensor) else np.asarray(observation)
+    return k

@@ -36,7 +36,8 @@ class RandomStream:
             self._block = np.random.Generator(bits).random((ROWS_PER_BLOCK, *self.shape))
             self._block_number = number
         self._position += 1
-        return self._block[row]
+        drawn: np.ndarray = self._block[row]
+        return drawn
 
     def state(self) -> dict[str, Any]:
         """

@@ -6,7 +6,8 @@ from typing import NamedTuple, Protocol
 
 import torch as th
 
-from sb3_knntd.exploration import Exploration, greedy
+from sb3_knntd.exploration import Exploration, Softmax, greedy
+from sb3_knntd.kernels.step import EPSILON_GREEDY, EXPECTED_SARSA, Q_LEARNING, SARSA, SOFTMAX
 
 
 class Choice(NamedTuple):
@@ -76,6 +77,14 @@ class DiscreteRule:
         self.exploration = exploration
         self.random_ties = random_ties
         self.n_uniforms = exploration.N_UNIFORMS
+
+    def kernel_arguments(self) -> tuple[int, int, bool]:
+        """
+        :return: ``rule`` of :func:`sb3_knntd.kernels.step.choose`
+        """
+        target = {"sarsa": SARSA, "q_learning": Q_LEARNING, "expected_sarsa": EXPECTED_SARSA}[self.target]
+        exploration = SOFTMAX if isinstance(self.exploration, Softmax) else EPSILON_GREEDY
+        return target, exploration, self.random_ties
 
     def choose(self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float) -> Choice:
         values = mean_rows(rows, probabilities)

@@ -38,8 +38,9 @@ class Perceiver(Protocol):
 
 def scale(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
     """Eq. 4: the range between the bounds becomes [-1, 1]; what lies outside is not clipped."""
-    x, low, high = (np.asarray(v, dtype=np.float64) for v in (x, low, high))
-    return 2.0 * (x - low) / (high - low) - 1.0
+    at, start, end = (np.asarray(v, dtype=np.float64) for v in (x, low, high))
+    scaled: Array = 2.0 * (at - start) / (end - start) - 1.0
+    return scaled
 
 
 def lattice(sizes: Sequence[int]) -> Array:
@@ -85,8 +86,7 @@ class NearestPoints:
         bandwidth: float = 1.0,
     ) -> None:
         self.bounds = bounds
-        is_array = isinstance(points, np.ndarray) and points.ndim == 2
-        self.points = scale(points, *bounds) if is_array else lattice(points)
+        self.points = scale(points, *bounds) if isinstance(points, np.ndarray) else lattice(points)
         self.n_points = len(self.points)
         self.n_neighbors = n_neighbors
         self.weights = weights

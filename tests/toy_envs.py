@@ -25,9 +25,7 @@ ENDS = {
 class EpisodeEnv(gym.Env[Any, Any]):
     """Counts episodes and ends them: the i-th has ``lengths[i]`` steps and ends with ``ends[i]``, in turn."""
 
-    def __init__(
-        self, lengths: Sequence[int] = (9, 14, 6), ends: Sequence[str] = ("terminated", "truncated")
-    ) -> None:
+    def __init__(self, lengths: Sequence[int] = (9, 14, 6), ends: Sequence[str] = ("terminated", "truncated")) -> None:
         self.lengths = tuple(lengths)
         self.ends = tuple(ends)
         self.episode = -1
@@ -56,9 +54,7 @@ class DriftEnv(EpisodeEnv):
     def __init__(self, offset: float = 0.0, **episodes: Any) -> None:
         super().__init__(**episodes)
         self.offset = offset
-        self.observation_space = spaces.Box(
-            np.float32([-3.0, -1.0]), np.float32([3.0, 1.0]), dtype=np.float32
-        )
+        self.observation_space = spaces.Box(np.float32([-3.0, -1.0]), np.float32([3.0, 1.0]), dtype=np.float32)
         self.action_space = spaces.Discrete(3)
         self.x = self.v = 0.0
 

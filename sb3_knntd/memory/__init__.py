@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from sb3_knntd.memory.table import QTable
+from sb3_knntd.memory.live import LiveStore
+from sb3_knntd.memory.table import DenseTable, HashedTable, QTable
 from sb3_knntd.memory.traces import Traces
 
-__all__ = ["QTable", "Traces"]
+__all__ = ["DenseTable", "HashedTable", "LiveStore", "QTable", "Traces"]

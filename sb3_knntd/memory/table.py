@@ -2,13 +2,108 @@
 
 from __future__ import annotations
 
+import sys
+from abc import ABC, abstractmethod
+from typing import Any, Protocol
+
+import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_knntd.kernels.memory import find_rows, rehash
 
-class QTable(nn.Module):
+
+class Lender(Protocol):
+    """Holds newer values of some rows than the table does."""
+
+    def publish(self) -> None:
+        """Write them into the table."""
+
+    def forget(self) -> None:
+        """Drop them: the table has been given other values."""
+
+
+class QTable(nn.Module, ABC):
     """
-    A dense table.
+    What every table does. A learner may keep newer values of some rows; it gives itself as ``lender``, and
+    whatever reads the table here asks it for them first.
+
+    :param n_actions: number of columns
+    :param initial_value: what every entry is at the start
+    """
+
+    values: th.Tensor
+    visited: th.Tensor
+
+    def __init__(self, n_actions: int, initial_value: float) -> None:
+        super().__init__()
+        self.n_actions = n_actions
+        self.initial_value = float(initial_value)
+        self.lender: Lender | None = None
+        #: number of rows visited, number of live points: see :mod:`sb3_knntd.kernels.memory`
+        self.counts = np.zeros(2, np.int64)
+
+    @property
+    @abstractmethod
+    def n_visited(self) -> int:
+        """Number of points that have been learned at."""
+
+    def sync(self) -> None:
+        """Bring the table up to date with its learner."""
+        if self.lender is not None:
+            self.lender.publish()
+
+    def _forget_lent(self) -> None:
+        if self.lender is not None:
+            self.lender.forget()
+
+    @abstractmethod
+    def entries(self) -> th.Tensor:
+        """
+        :return: the rows there are, up to date, shape (n_rows, n_actions)
+        """
+
+    @abstractmethod
+    def points(self) -> th.Tensor | None:
+        """
+        :return: the point of each row, shape (n_rows,), int64; ``None`` if the points are the rows
+        """
+
+    @abstractmethod
+    def rows(self, indices: th.Tensor) -> th.Tensor:
+        """
+        :param indices: points, shape (batch, k), int64
+        :return: their values, up to date, shape (batch, k, n_actions)
+        """
+
+    @property
+    @abstractmethod
+    def room(self) -> int:
+        """How many more points may be learned at before :meth:`reserve` has to be called."""
+
+    @abstractmethod
+    def reserve(self, n_points: int) -> None:
+        """
+        Make room.
+
+        :param n_points: how many new points there may be in the next step
+        """
+
+    @abstractmethod
+    def arrays(self) -> tuple[Any, ...]:
+        """
+        :return: values, visited, row_points, row_slots and initial of :mod:`sb3_knntd.kernels.memory`, sharing
+            memory with this table
+        """
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        self.sync()
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+
+
+class DenseTable(QTable):
+    """
+    A row for every point.
 
     :param n_points: number of rows
     :param n_actions: number of columns
@@ -16,18 +111,125 @@ class QTable(nn.Module):
     :param dtype: floating type of the entries
     """
 
-    values: th.Tensor
-    visited: th.Tensor
-
     def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
-        super().__init__()
-        self.register_buffer("values", th.full((n_points, n_actions), initial_value, dtype=dtype))
+        super().__init__(n_actions, initial_value)
+        self.register_buffer("values", th.full((n_points, n_actions), self.initial_value, dtype=dtype))
         #: which rows have been learned at, shape (n_points,)
         self.register_buffer("visited", th.zeros(n_points, dtype=th.bool))
 
+    @property
+    def n_visited(self) -> int:
+        return int(self.visited.sum())
+
+    def entries(self) -> th.Tensor:
+        self.sync()
+        return self.values
+
+    def points(self) -> None:
+        return None
+
     def rows(self, indices: th.Tensor) -> th.Tensor:
-        """
-        :param indices: points, shape (batch, k), int64
-        :return: their values, shape (batch, k, n_actions)
-        """
+        self.sync()
         return self.values[indices]
+
+    @property
+    def room(self) -> int:
+        return sys.maxsize
+
+    def reserve(self, n_points: int) -> None:
+        """Nothing to do: there is room for every point."""
+
+    def arrays(self) -> tuple[Any, ...]:
+        no_points, no_slots = np.empty(0, np.int64), np.empty((0, 2), np.int64)
+        return self.values.numpy(), self.visited.numpy(), no_points, no_slots, self.initial_value
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        self._forget_lent()
+        super()._load_from_state_dict(*args)
+
+
+class HashedTable(QTable):
+    """
+    A row for every point that has been learned at, made then; all others are worth the initial value. For
+    lattices larger than memory. On the CPU only.
+
+    :param n_actions: number of columns
+    :param initial_value: what every entry is at the start
+    :param dtype: floating type of the entries
+    """
+
+    SMALLEST = 1024
+
+    row_points: th.Tensor
+
+    def __init__(self, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
+        super().__init__(n_actions, initial_value)
+        self.register_buffer("values", th.empty((0, n_actions), dtype=dtype))
+        self.register_buffer("visited", th.empty(0, dtype=th.bool))
+        self.register_buffer("row_points", th.empty(0, dtype=th.int64))
+        self._resize(self.SMALLEST)
+
+    @property
+    def n_visited(self) -> int:
+        return int(self.counts[0])
+
+    def entries(self) -> th.Tensor:
+        self.sync()
+        return self.values[: self.n_visited]
+
+    def points(self) -> th.Tensor:
+        return self.row_points[: self.n_visited]
+
+    def rows(self, indices: th.Tensor) -> th.Tensor:
+        self.sync()
+        found = np.empty(indices.numel(), np.int64)
+        find_rows(indices.reshape(-1).numpy(), self._slots, found)
+        rows = th.from_numpy(found).reshape(indices.shape)
+        return th.where((rows >= 0)[..., None], self.values[rows.clamp(min=0)], self.initial_value)
+
+    @property
+    def room(self) -> int:
+        return len(self.values) - self.n_visited
+
+    def reserve(self, n_points: int) -> None:
+        if self.room < n_points:
+            self._resize(max(2 * len(self.values), self.n_visited + n_points))
+
+    def arrays(self) -> tuple[Any, ...]:
+        return self.values.numpy(), self.visited.numpy(), self.row_points.numpy(), self._slots, self.initial_value
+
+    def _resize(self, capacity: int) -> None:
+        for name, fill in (("values", self.initial_value), ("visited", False), ("row_points", -1)):
+            old = getattr(self, name)
+            new = th.full((capacity, *old.shape[1:]), fill, dtype=old.dtype)
+            new[: len(old)] = old[:capacity]
+            setattr(self, name, new)
+        self._slots = make_slots(capacity)
+        rehash(self.row_points.numpy(), self.n_visited, self._slots)
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        for name in ("values", "visited", "row_points"):
+            destination[prefix + name] = destination[prefix + name][: self.n_visited].clone()
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        self._forget_lent()
+        n_rows = len(state_dict[prefix + "values"])
+        self.counts[0] = 0
+        self._resize(max(self.SMALLEST, n_rows))
+        state_dict = dict(state_dict)
+        for name in ("values", "visited", "row_points"):
+            whole = getattr(self, name).clone()
+            whole[:n_rows] = state_dict[prefix + name]
+            state_dict[prefix + name] = whole
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self.counts[0] = n_rows
+        rehash(self.row_points.numpy(), n_rows, self._slots)
+
+
+def make_slots(capacity: int) -> np.ndarray:
+    """
+    :param capacity: how many points a hash is to hold
+    :return: an empty hash, at most half full then, see :mod:`sb3_knntd.kernels.memory`
+    """
+    return np.full((1 << (2 * capacity - 1).bit_length(), 2), -1, np.int64)

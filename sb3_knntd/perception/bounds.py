@@ -12,15 +12,17 @@ from torch import nn
 #: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
 LARGEST_SENSIBLE_BOUND = 1e10
 #: A measured range is widened by this share on either side, since a better policy sees more than a random one.
-MARGIN = 0.1
+MARGIN = 0.25
+#: Scaled values end here, far outside of any point, so that no distance swallows the differences of others.
+FARTHEST = 1e4
 
 
 class Bounds(nn.Module):
     """
-    Affine map of each observation dimension onto [-1, 1] (eq. 4 of the paper). Values outside are not clipped.
+    Affine map of each observation dimension onto [-1, 1] (eq. 4 of the paper). Values outside are kept, up to 10,000.
 
     A dimension whose bounds are infinite, larger than 1e10 or empty (low >= high) is *open*: it stands at
-    [-1, 1] until :meth:`measure` has seen observations, then at their range, widened by a tenth on either side.
+    [-1, 1] until :meth:`measure` has seen observations, then at their range, widened by a quarter on either side.
 
     :param low: lower bounds, shape (obs_dim,), observation units
     :param high: upper bounds, shape (obs_dim,), observation units
@@ -71,7 +73,7 @@ class Bounds(nn.Module):
         :param observations: shape (..., obs_dim), observation units
         :return: the same in scaled units, [-1, 1] within the bounds (eq. 4)
         """
-        return 2.0 * ((observations - self.low) / (self.high - self.low)) - 1.0
+        return (2.0 * ((observations - self.low) / (self.high - self.low)) - 1.0).clamp(-FARTHEST, FARTHEST)
 
     def unscale(self, scaled: th.Tensor) -> th.Tensor:
         """

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
 
-from sb3_knntd.perception.bounds import Bounds
+from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.points import Points
-from sb3_knntd.perception.search import Search
-from sb3_knntd.perception.weights import Weights
+from sb3_knntd.perception.search import Neighbors, Search
+from sb3_knntd.perception.weights import KernelWeights, Weights
 
 
 class Perception(NamedTuple):
@@ -46,6 +46,27 @@ class Perceiver(nn.Module):
     def fit(self) -> None:
         """Bring the search up to date with the bounds and their device."""
         self.search.fit(self.bounds)
+        self._kernel_arguments: tuple[Any, ...] | None = None
+
+    def kernel_arguments(self) -> tuple[Any, ...]:
+        """
+        :return: ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`
+        :raises TypeError: if the weights are a function that no kernel knows
+        """
+        if self._kernel_arguments is None:
+            if not isinstance(self.weights, KernelWeights):
+                raise TypeError("weights that are a function cannot be compiled")
+            low, high = self.bounds.low.numpy(), self.bounds.high.numpy()
+            weights = (self.weights.KERNEL, self.weights.bandwidth)
+            self._kernel_arguments = (low, high - low, FARTHEST, *self.search.kernel_arguments(), *weights)
+        return self._kernel_arguments
+
+    def find(self, observations: th.Tensor) -> Neighbors:
+        """
+        :param observations: shape (batch, *obs_shape), any number type, observation units
+        :return: their neighbours
+        """
+        return self.search.query(self.bounds.scale(self._flat(observations)))
 
     def measure(self, observations: th.Tensor) -> None:
         """
@@ -61,7 +82,7 @@ class Perceiver(nn.Module):
         :param observations: shape (batch, *obs_shape), any number type, observation units
         :return: their perceptions
         """
-        indices, squared_distances = self.search.query(self.bounds.scale(self._flat(observations)))
+        indices, squared_distances = self.find(observations)
         weights = self.weights(squared_distances)
         return Perception(indices, weights / weights.sum(dim=1, keepdim=True))
 

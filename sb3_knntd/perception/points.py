@@ -15,7 +15,7 @@ from sb3_knntd.checks import check_integer
 from sb3_knntd.perception.bounds import Bounds
 
 #: ``points="auto"``: a lattice of about this many points in all, with at most so many in a dimension.
-AUTO_POINTS = 4096
+AUTO_POINTS = 8000
 AUTO_POINTS_PER_DIMENSION = 20
 
 
@@ -46,7 +46,7 @@ class Lattice(Points):
     """
 
     def __init__(self, shape: Sequence[int]) -> None:
-        self.shape = tuple(shape)
+        self.shape = tuple(int(n) for n in shape)
         self.obs_dim = len(self.shape)
         self.n_points = math.prod(self.shape)
         self.axes = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in self.shape]

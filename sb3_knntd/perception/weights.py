@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch as th
 
 from sb3_knntd.checks import check_number, check_word
+from sb3_knntd.kernels.perceive import GAUSSIAN, INVERSE_QUADRATIC
 
 
 class Weights(Protocol):
@@ -16,21 +18,36 @@ class Weights(Protocol):
     def __call__(self, squared_distances: th.Tensor, /) -> th.Tensor: ...
 
 
-class InverseQuadratic:
+class KernelWeights(ABC):
+    """
+    Weights that the compiled step has in it.
+
+    :param bandwidth: h, scaled units
+    """
+
+    KERNEL: ClassVar[int]
+
+    def __init__(self, bandwidth: float = 1.0) -> None:
+        self.bandwidth = float(bandwidth)
+
+    @abstractmethod
+    def __call__(self, squared_distances: th.Tensor) -> th.Tensor: ...
+
+
+class InverseQuadratic(KernelWeights):
     """
     w = 1 / (1 + d²/h²); with h = 1 eq. 5 of the paper.
 
     :param bandwidth: h, scaled units
     """
 
-    def __init__(self, bandwidth: float = 1.0) -> None:
-        self.bandwidth = float(bandwidth)
+    KERNEL = INVERSE_QUADRATIC
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
         return 1.0 / (1.0 + squared_distances / (self.bandwidth * self.bandwidth))
 
 
-class Gaussian:
+class Gaussian(KernelWeights):
     """
     w = exp(-d² / 2h²), times a constant of each row that the normalisation takes out again: the nearest
     neighbour has weight 1, so that an observation far outside the points still has a perception.
@@ -38,8 +55,7 @@ class Gaussian:
     :param bandwidth: h, scaled units
     """
 
-    def __init__(self, bandwidth: float = 1.0) -> None:
-        self.bandwidth = float(bandwidth)
+    KERNEL = GAUSSIAN
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
         excess = squared_distances - squared_distances[:, :1]
@@ -72,7 +88,7 @@ class Custom:
         return weights
 
 
-_BUILT_IN = {"inverse_quadratic": InverseQuadratic, "gaussian": Gaussian}
+_BUILT_IN: dict[str, type[KernelWeights]] = {"inverse_quadratic": InverseQuadratic, "gaussian": Gaussian}
 
 
 def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from sb3_knntd.checks import check_word
-from sb3_knntd.perception.points import Points
+from sb3_knntd.kernels import jit
+from sb3_knntd.perception.points import Lattice, Points
 from sb3_knntd.perception.search.base import Neighbors, Search
 from sb3_knntd.perception.search.brute import BruteSearch
+from sb3_knntd.perception.search.lattice import LatticeSearch
 
-__all__ = ["SEARCHES", "BruteSearch", "Neighbors", "Search", "make_search"]
+__all__ = ["SEARCHES", "BruteSearch", "LatticeSearch", "Neighbors", "Search", "make_search"]
 
 #: Every search by its name.
-SEARCHES: dict[str, type[Search]] = {"brute": BruteSearch}
+SEARCHES: dict[str, type[Search]] = {"brute": BruteSearch, "lattice": LatticeSearch}
 
 
 def make_search(search: str, points: Points, n_neighbors: int) -> Search:
@@ -19,7 +21,9 @@ def make_search(search: str, points: Points, n_neighbors: int) -> Search:
     :param points: the points to search
     :param n_neighbors: k
     :return: the search
-    :raises ValueError: if the name is unknown
+    :raises ValueError: if the name is unknown, or the search cannot be used for these points
     """
     check_word("search", search, ["auto", *SEARCHES])
-    return SEARCHES["brute" if search == "auto" else search](points, n_neighbors)
+    if search == "auto":
+        search = "lattice" if isinstance(points, Lattice) and jit.AVAILABLE else "brute"
+    return SEARCHES[search](points, n_neighbors)

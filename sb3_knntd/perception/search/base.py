@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 
+from sb3_knntd.kernels.perceive import FOUND
 from sb3_knntd.perception.bounds import Bounds
 from sb3_knntd.perception.points import Points
 
@@ -30,6 +32,7 @@ class Search(ABC):
 
     :param points: the points
     :param n_neighbors: k
+    :raises ValueError: if the search cannot be used for these points
     """
 
     def __init__(self, points: Points, n_neighbors: int) -> None:
@@ -50,3 +53,10 @@ class Search(ABC):
         :param scaled: observations in scaled units, shape (batch, obs_dim), float64
         :return: their neighbours
         """
+
+    def kernel_arguments(self) -> tuple[Any, ...]:
+        """
+        :return: search, axes, offsets and columns of ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`; by
+            default it is told that neighbours are found before it is called
+        """
+        return FOUND, np.empty(0), np.empty(0, np.int64), np.empty((0, 0))

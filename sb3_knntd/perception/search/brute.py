@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch as th
 
+from sb3_knntd.kernels.perceive import ALL
 from sb3_knntd.perception.bounds import Bounds
 from sb3_knntd.perception.search.base import Neighbors, Search
 
@@ -23,6 +27,9 @@ class BruteSearch(Search):
         rows = max(1, MAX_DISTANCES // self.points.n_points)
         parts = [self._query(chunk) for chunk in scaled.split(rows)]
         return parts[0] if len(parts) == 1 else Neighbors(*(th.cat(column) for column in zip(*parts, strict=True)))
+
+    def kernel_arguments(self) -> tuple[Any, ...]:
+        return ALL, np.empty(0), np.empty(0, np.int64), self._columns.numpy()
 
     def _query(self, scaled: th.Tensor) -> Neighbors:
         # Summed dimension by dimension: th.cdist takes a matrix product for many rows, and a root for

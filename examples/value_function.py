@@ -1,0 +1,25 @@
+"""
+Train on Mountain-Car for some seconds and draw what was learned: how good each state is, and what to do there.
+
+    python examples/value_function.py value_function.png
+"""
+
+import sys
+from pathlib import Path
+
+from sb3_knntd import KNNTD
+from sb3_knntd.plots import figure_of, plot_value_function
+
+
+def main() -> None:
+    path = Path(sys.argv[1] if len(sys.argv) > 1 else "value_function.png")
+    model = KNNTD("MountainCar-v0", seed=0)
+    model.learn(20_000)
+    value_axes, _ = plot_value_function(model)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure_of(value_axes).savefig(path)
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

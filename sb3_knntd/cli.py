@@ -1,0 +1,127 @@
+"""The command ``sb3-knntd``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    # argparse's own class is generic only in type stubs.
+    Subparsers = argparse._SubParsersAction["Parser"]
+
+#: Exit code after Ctrl-C, the shell's own for it.
+INTERRUPTED = 130
+
+
+class CommandError(Exception):
+    """What was asked for cannot be done. The user is shown the message alone, without a traceback."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports a mistake in one line: with the usage before it the reason would be hard to see."""
+
+    def error(self, message: str) -> NoReturn:
+        """
+        :param message: what is wrong
+        :raises SystemExit: with code 2, always
+        """
+        self.exit(2, f"{self.prog}: error: {' '.join(message.split())}\n")
+
+
+def positive_int(text: str) -> int:
+    """
+    :param text: argument of the command line
+    :return: the integer it is
+    :raises argparse.ArgumentTypeError: if it is none, or less than 1
+    """
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1; got {text!r}")
+    return number
+
+
+def seed_int(text: str) -> int:
+    """
+    :param text: argument of the command line
+    :return: the integer it is
+    :raises argparse.ArgumentTypeError: if it is none, or no seed NumPy takes
+    """
+    try:
+        number = int(text)
+    except ValueError:
+        number = -1
+    if not 0 <= number < 2**31:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 2147483647; got {text!r}")
+    return number
+
+
+def require(*modules: str) -> None:
+    """
+    :param modules: modules that the command cannot do without
+    :raises CommandError: if some of them are not installed
+    """
+    missing = [module for module in modules if find_spec(module) is None]
+    if missing:
+        raise CommandError(f'{" and ".join(missing)} not installed: pip install "sb3-knntd[extra]"')
+
+
+def _add_demo(subparsers: Subparsers) -> None:
+    parser = subparsers.add_parser(
+        "demo",
+        help="train on an environment and show what was learned",
+        description="Train KNNTD on an environment, save and reload the model, evaluate it beside a random policy, "
+        "and draw its learning curve and value function.",
+    )
+    parser.add_argument("--env", default="MountainCar-v0", metavar="ID", help="gymnasium id (default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=positive_int, default=20_000, metavar="N", help="environment steps (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=seed_int, default=0, metavar="N", help="random seed (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for all files (default: %(default)s)"
+    )
+    parser.set_defaults(run=_run_demo)
+
+
+def _run_demo(args: argparse.Namespace) -> int:
+    require("tqdm", "rich", "tensorboard", "matplotlib")
+    from sb3_knntd.demo import demo
+
+    return 0 if demo(args.env, args.steps, args.seed, args.out) else INTERRUPTED
+
+
+#: Each adds one command: its parser, and with ``set_defaults(run=...)`` the function that runs it and returns
+#: the exit code.
+COMMANDS: tuple[Callable[[Subparsers], None], ...] = (_add_demo,)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    :param argv: arguments of the command line, without the program's name; by default those it was called with
+    :return: exit code
+    :raises SystemExit: with code 2 after a mistake of the user's, with 0 after ``--help`` and ``--version``
+    """
+    parser = Parser(
+        prog="sb3-knntd", description="kNN-TD(λ) for Stable-Baselines3: a table at k nearest points, no network."
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version('sb3-knntd')}")
+    subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
+    for add_command in COMMANDS:
+        add_command(subparsers)
+    args = parser.parse_args(argv)
+    try:
+        exit_code: int = args.run(args)
+    except CommandError as error:
+        subparsers.choices[args.command].error(str(error))
+    except KeyboardInterrupt:
+        print("\nInterrupted.", file=sys.stderr)
+        return INTERRUPTED
+    return exit_code

@@ -1,0 +1,31 @@
+"""numba's compiler, or, where it cannot be used, none."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+try:
+    import numba
+
+    AVAILABLE = not os.environ.get("NUMBA_DISABLE_JIT", "0") == "1"
+    #: why numba cannot be used, empty if it can
+    REASON = "" if AVAILABLE else "NUMBA_DISABLE_JIT is set"
+except Exception as error:  # a numba that does not fit the installed NumPy raises more than ImportError
+    AVAILABLE = False
+    REASON = f"{type(error).__name__}: {error}"
+
+
+def jit(function: Function) -> Function:
+    """
+    Compile on the first call, keep the result on disk, and let other threads run meanwhile.
+
+    :param function: to be compiled
+    :return: the compiled function, or ``function`` itself without numba
+    """
+    if not AVAILABLE:
+        return function
+    return cast(Function, numba.njit(cache=True, nogil=True)(function))

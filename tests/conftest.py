@@ -1,0 +1,73 @@
+"""What the behaviour tests share: environments in which everything is known, and models small enough to be quick."""
+
+from __future__ import annotations
+
+import csv
+import pathlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from toy_envs import DriftEnv
+
+from sb3_knntd import KNNTD
+
+# Every operation here is tiny: more threads only wait for each other, the more so under pytest-xdist.
+th.set_num_threads(1)
+
+
+def _monitored_drift(**kwargs: Any) -> gym.Env[Any, Any]:
+    return Monitor(DriftEnv(**kwargs))
+
+
+@pytest.fixture
+def make_venv() -> Iterator[Callable[..., VecEnv]]:
+    """Makes ``make_venv(n_envs, vec_env_cls)``: drifting points whose episodes have 9, 14 and 6 steps, in turn."""
+    made: list[VecEnv] = []
+
+    def make(
+        n_envs: int = 1, vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv, **kwargs: Any
+    ) -> VecEnv:
+        # An offset each, or all environments would live through the same.
+        made.append(vec_env_cls([partial(_monitored_drift, offset=0.23 * index, **kwargs) for index in range(n_envs)]))
+        return made[-1]
+
+    yield make
+    for venv in made:
+        venv.close()
+
+
+@pytest.fixture
+def make_model(make_venv: Callable[..., VecEnv]) -> Callable[..., KNNTD]:
+    """Makes ``make_model(env, **arguments)``: a model with 48 points, by default of one drifting point, seed 0."""
+
+    def make(env: Any = None, **kwargs: Any) -> KNNTD:
+        arguments = {"points": (8, 6), "bounds": (DriftEnv.LOW, DriftEnv.HIGH), "n_neighbors": 4, "seed": 0}
+        return KNNTD(make_venv() if env is None else env, **{**arguments, **kwargs})
+
+    return make
+
+
+@pytest.fixture
+def observations() -> np.ndarray:
+    """A hundred places inside and outside of the drifting point's bounds, shape (100, 2)."""
+    width = DriftEnv.HIGH - DriftEnv.LOW
+    places = np.random.default_rng(3).uniform(DriftEnv.LOW - 0.2 * width, DriftEnv.HIGH + 0.2 * width, size=(100, 2))
+    return places.astype(np.float32)
+
+
+@pytest.fixture
+def read_log() -> Callable[[pathlib.Path], list[dict[str, float]]]:
+    """Reads what SB3's CSV logger wrote into a folder: one dict a dump, without what was not logged in it."""
+
+    def read(folder: pathlib.Path) -> list[dict[str, float]]:
+        with open(folder / "progress.csv", newline="") as file:
+            return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+
+    return read

@@ -1,0 +1,99 @@
+"""The same seed gives the same table to the last bit, another seed another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from sb3_knntd import KNNTD
+
+MakeModel = Callable[..., KNNTD]
+MakeVenv = Callable[..., VecEnv]
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "epsilon": {"exploration_initial_eps": 0.5, "exploration_fraction": 1.0},
+    "softmax": {"exploration": "softmax"},
+    "random ties": {"exploration_initial_eps": 0.0, "tie_break": "random"},
+}
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_seeds(make_model: MakeModel, make_venv: MakeVenv, settings: dict[str, Any], n_envs: int) -> None:
+    # The environments know no chance: all that differs is what the model draws.
+    first, second, other = (make_model(make_venv(n_envs), seed=seed, **settings).learn(150) for seed in (5, 5, 6))
+    assert th.equal(first.policy.q_table, second.policy.q_table)
+    assert not th.equal(first.policy.q_table, other.policy.q_table)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_environments_are_seeded(n_envs: int) -> None:
+    def learn(seed: int) -> th.Tensor:
+        venv = make_vec_env(lambda: gym.make("MountainCar-v0", max_episode_steps=25), n_envs)
+        # Nothing is drawn but the starts of the episodes.
+        model = KNNTD(venv, points=8, n_neighbors=4, exploration_initial_eps=0.0, tie_break="first", seed=seed)
+        return model.learn(120).policy.q_table
+
+    assert th.equal(learn(1), learn(1))
+    assert not th.equal(learn(1), learn(2))
+
+
+def test_no_seed_no_repetition(make_model: MakeModel) -> None:
+    first, second = (make_model(seed=None, exploration_initial_eps=0.5).learn(150) for _ in range(2))
+    assert not th.equal(first.policy.q_table, second.policy.q_table)
+
+
+def test_no_seed_does_not_hang_on_the_global_generators(make_model: MakeModel) -> None:
+    tables = []
+    for _ in range(2):
+        np.random.seed(0)
+        th.manual_seed(0)
+        tables.append(make_model(seed=None, exploration_initial_eps=0.5).learn(150).policy.q_table)
+    assert not th.equal(*tables)
+
+
+def test_draws_do_not_hang_on_other_users_of_the_global_generators(make_model: MakeModel) -> None:
+    def draw(*_: Any) -> bool:
+        np.random.random()
+        th.rand(1)
+        return True
+
+    alone, beside = make_model().learn(150), make_model().learn(150, callback=draw)
+    assert th.equal(alone.policy.q_table, beside.policy.q_table)
+
+
+def test_set_random_seed_begins_the_sequence_anew(make_model: MakeModel) -> None:
+    settings = SETTINGS["epsilon"]
+    reseeded = make_model(seed=1, **settings)
+    reseeded.set_random_seed(5)
+    assert th.equal(reseeded.learn(150).policy.q_table, make_model(seed=5, **settings).learn(150).policy.q_table)
+
+
+def test_kind_of_vec_env_decides_nothing(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    dummy, subproc = (make_model(make_venv(2, kind)).learn(120) for kind in (DummyVecEnv, SubprocVecEnv))
+    assert dummy.policy.q_table.any()
+    # DummyVecEnv rounds rewards to float32, and SubprocVecEnv does not.
+    th.testing.assert_close(dummy.policy.q_table, subproc.policy.q_table, rtol=1e-5, atol=1e-5)
+
+
+def test_first_ties_without_exploration_involve_no_chance(make_model: MakeModel) -> None:
+    settings = {"exploration_initial_eps": 0.0, "tie_break": "first"}
+    first, second = (make_model(seed=seed, **settings).learn(150) for seed in (1, 2))
+    assert th.equal(first.policy.q_table, second.policy.q_table)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_length_of_the_call_decides_nothing_without_schedules(
+    make_model: MakeModel, make_venv: MakeVenv, n_envs: int
+) -> None:
+    settings = {"exploration_initial_eps": 0.3, "exploration_final_eps": 0.3}
+    at_once = make_model(make_venv(n_envs), **settings).learn(150)
+    in_parts = make_model(make_venv(n_envs), **settings).learn(60).learn(90, reset_num_timesteps=False)
+    assert th.equal(at_once.policy.q_table, in_parts.policy.q_table)

@@ -1,0 +1,284 @@
+"""Pictures: what is drawn is what was given, or what the policy says."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import matplotlib
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from matplotlib.axes import Axes
+
+from sb3_knntd import KNNTD
+from sb3_knntd.plots import (
+    NAMES,
+    Names,
+    figure_of,
+    new_figure,
+    plot_learning_curve,
+    plot_value_function,
+    running_median,
+    telling_dims,
+    value_grid,
+)
+
+
+class StillEnv(gym.Env[np.ndarray, int]):
+    """Has spaces, and nothing happens in it."""
+
+    def __init__(self, low: list[float], high: list[float], actions: spaces.Discrete) -> None:
+        self.observation_space = spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+        self.action_space = actions
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        return self.observation_space.low, {}
+
+
+def make_model(low: list[float], high: list[float], n_actions: int = 3, start: int = 0, **arguments: Any) -> KNNTD:
+    env = StillEnv(low, high, spaces.Discrete(n_actions, start=start))
+    return KNNTD(env, **{"points": 9, "n_neighbors": 4, **arguments})
+
+
+def fill(model: KNNTD, values: Any) -> None:
+    """Give the table values, a function of the points, (n_points, obs_dim) -> (n_points, n_actions)."""
+    model.policy.q_table.copy_(th.as_tensor(values(model.policy.points.numpy())))
+
+
+def images(axes: tuple[Axes, Axes]) -> tuple[np.ma.MaskedArray[Any, Any], np.ma.MaskedArray[Any, Any]]:
+    return tuple(np.ma.asarray(ax.images[0].get_array()) for ax in axes)  # type: ignore[return-value]
+
+
+def lines_of(axes: Axes) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    return {str(line.get_label()): (np.asarray(line.get_xdata()), np.asarray(line.get_ydata())) for line in axes.lines}
+
+
+# ------------------------------------------------------------- learning curve
+
+
+def test_running_median() -> None:
+    np.testing.assert_array_equal(running_median([5.0, 1.0, 3.0, 9.0, 2.0], 3), [5, 3, 3, 3, 3])
+    np.testing.assert_array_equal(running_median([5.0, 1.0], 1), [5, 1])
+    assert len(running_median([], 3)) == 0
+    with pytest.raises(ValueError, match="window must be at least 1; got 0"):
+        running_median([1.0], 0)
+
+
+def test_the_learning_curve_shows_episodes_median_and_baseline() -> None:
+    returns = np.random.default_rng(0).normal(size=80).cumsum()
+    steps = np.arange(1, 81) * 50
+    axes = plot_learning_curve(steps, returns, baseline=-3.5)
+    lines = lines_of(axes)
+    np.testing.assert_array_equal(lines["each episode"], (steps, returns))
+    np.testing.assert_array_equal(lines["running median of 8 episodes"], (steps, running_median(returns, 8)))
+    assert set(lines["random policy, mean"][1]) == {-3.5}
+    faint, bold, dashed = axes.lines
+    assert faint.get_alpha() < 0.5
+    assert bold.get_linewidth() >= 2
+    assert dashed.get_linestyle() == "--"
+    assert axes.get_xlabel() == "environment steps"
+    assert axes.get_ylabel() == "episode return"
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == list(lines)
+
+
+@pytest.mark.parametrize(("n_episodes", "window"), [(1, 5), (120, 12), (3000, 100)])
+def test_the_median_is_over_a_tenth_of_the_episodes(n_episodes: int, window: int) -> None:
+    axes = plot_learning_curve(np.arange(n_episodes), np.zeros(n_episodes))
+    assert f"running median of {window} episodes" in lines_of(axes)
+
+
+def test_a_learning_curve_without_episodes_says_so() -> None:
+    axes = plot_learning_curve([], [], baseline=1.0)
+    assert [text.get_text() for text in axes.texts] == ["no episode has ended"]
+    assert plot_learning_curve([], []).get_legend() is None
+
+
+def test_a_learning_curve_needs_a_step_for_each_return() -> None:
+    with pytest.raises(ValueError, match="got 2 and 3"):
+        plot_learning_curve([1, 2], [1, 2, 3])
+
+
+def test_curves_are_drawn_where_they_are_told_to() -> None:
+    axes = new_figure(4, 3).add_subplot()
+    assert plot_learning_curve([1], [1.0], axes=axes) is axes
+    pair = tuple(new_figure(8, 3).subplots(1, 2))
+    model = make_model([0, 0], [1, 1])
+    assert plot_value_function(model, axes=pair, resolution=5) == pair
+
+
+# -------------------------------------------------------------- value function
+
+
+def test_the_grid_holds_what_the_policy_says() -> None:
+    model = make_model([0, -5], [2, 5])
+    fill(model, lambda points: np.stack([points[:, 0], -points[:, 1], points.sum(axis=1)], axis=1))
+    grid = value_grid(model, resolution=8)
+    assert grid.extent == (0, 2, -5, 5)
+    assert grid.fixed == {}
+    assert grid.q_values.shape == (8, 8, 3)
+    # Row 6 from below is at -5 + 6.5/8 of the height, column 1 at 1.5/8 of the width.
+    here = model.policy.q_values(np.array([2 * 1.5 / 8, -5 + 10 * 6.5 / 8]))[0]
+    np.testing.assert_array_equal(grid.q_values[6, 1], here)
+
+
+def test_dimensions_may_be_exchanged() -> None:
+    model = make_model([0, -5], [2, 5])
+    fill(model, lambda points: np.stack([points[:, 0], -points[:, 1], points.sum(axis=1)], axis=1))
+    straight, turned = value_grid(model, resolution=6), value_grid(model, dims=(1, 0), resolution=6)
+    assert turned.extent == (-5, 5, 0, 2)
+    np.testing.assert_array_equal(turned.q_values, straight.q_values.transpose(1, 0, 2))
+
+
+def test_other_dimensions_stand_in_the_middle_or_where_they_are_told_to() -> None:
+    model = make_model([0, -5, 10, 2], [2, 5, 20, 3], points=4)
+    fill(model, lambda points: np.stack([points.sum(axis=1)] * 3, axis=1))
+    grid = value_grid(model, dims=(3, 1), fixed={2: 18}, resolution=4)
+    assert grid.fixed == {0: 1.0, 2: 18.0}
+    here = model.policy.q_values(np.array([1.0, -5 + 10 * 0.5 / 4, 18.0, 2 + 2.5 / 4]))[0]
+    np.testing.assert_array_equal(grid.q_values[0, 2], here)
+
+
+def test_the_picture_is_the_greatest_value_and_its_action() -> None:
+    model = make_model([0, -5], [2, 5])
+    fill(model, lambda points: 1 + np.stack([points[:, 0], -points[:, 1], points.sum(axis=1)], axis=1))
+    grid = value_grid(model, resolution=20)
+    axes = plot_value_function(model, resolution=20)
+    values, actions = images(axes)
+    np.testing.assert_array_equal(values, grid.q_values.max(axis=2))
+    np.testing.assert_array_equal(actions, grid.q_values.argmax(axis=2))
+    assert len(np.unique(actions)) == 3
+    for ax in axes:
+        assert ax.images[0].get_extent() == [0, 2, -5, 5]
+        assert ax.images[0].origin == "lower"
+    assert not axes[0].texts
+
+
+def test_where_nothing_was_learned_nothing_is_claimed() -> None:
+    model = make_model([0, 0], [1, 1], initial_value=2.0)
+    fill(model, lambda points: np.where(points[:, :1] < 0.5, -1.0, 2.0) * np.ones(3))
+    axes = plot_value_function(model, resolution=40)
+    values, actions = images(axes)
+    np.testing.assert_array_equal(values.mask, actions.mask)
+    assert not values.mask[:, :15].any()
+    assert values.mask[:, 25:].all()
+    assert [text.get_text() for text in axes[0].texts] == ["grey: nothing learned"]
+
+
+def test_an_untrained_model_can_be_drawn(tmp_path: Path) -> None:
+    axes = plot_value_function(make_model([0, 0], [1, 1]), resolution=10)
+    assert images(axes)[0].mask.all()
+    figure_of(axes[0]).savefig(tmp_path / "picture.png")
+
+
+def test_known_environments_are_drawn_with_their_names() -> None:
+    model = KNNTD("CartPole-v1", points=3)
+    axes = plot_value_function(model, dims=(2, 3), fixed={0: 1.5}, resolution=5)
+    assert axes[0].get_xlabel() == axes[1].get_xlabel() == "pole angle (rad)"
+    assert axes[0].get_ylabel() == "pole angular velocity (rad/s)"
+    figure = figure_of(axes[0])
+    assert figure.get_suptitle() == "where cart position (m) = 1.5, cart velocity (m/s) = 0"
+    assert [label.get_text() for label in figure.axes[3].get_yticklabels()] == ["push left", "push right"]
+
+
+@pytest.mark.parametrize("env_id", sorted(NAMES))
+def test_names_fit_their_environment(env_id: str) -> None:
+    env = gym.make(env_id)
+    assert env.observation_space.shape == (len(NAMES[env_id].observations),)
+    assert env.action_space.n == len(NAMES[env_id].actions)  # type: ignore[attr-defined]
+
+
+def test_unknown_environments_are_drawn_with_numbers() -> None:
+    axes = plot_value_function(make_model([0, 0], [1, 1], n_actions=2, start=5), resolution=5)
+    assert axes[0].get_xlabel() == "observation[0]"
+    assert axes[0].get_ylabel() == "observation[1]"
+    labels = figure_of(axes[0]).axes[3].get_yticklabels()
+    assert [label.get_text() for label in labels] == ["action 5", "action 6"]
+
+
+def test_names_can_be_given() -> None:
+    names = Names(("level (m)", "inflow (l/s)"), ("shut", "open"))
+    model = make_model([0, 0], [1, 1], n_actions=2)
+    axes = plot_value_function(model, resolution=5, names=names)
+    assert axes[0].get_xlabel() == "level (m)"
+    with pytest.raises(ValueError, match="names must hold one for each"):
+        plot_value_function(model, names=Names(("level (m)",), ("shut", "open")))
+
+
+def test_many_actions_are_named_in_part() -> None:
+    axes = plot_value_function(make_model([0, 0], [1, 1], n_actions=25), resolution=5)
+    labels = [label.get_text() for label in figure_of(axes[0]).axes[3].get_yticklabels()]
+    assert labels == [f"action {number}" for number in range(0, 25, 3)]
+
+
+def test_action_colors_differ_in_lightness() -> None:
+    axes = plot_value_function(make_model([0, 0], [1, 1], n_actions=5), resolution=5)
+    colors = axes[1].images[0].get_cmap()(np.arange(5))
+    lightness = colors[:, :3] @ [0.2126, 0.7152, 0.0722]
+    assert np.diff(lightness).min() > 0.08
+
+
+def test_telling_dimensions_are_those_the_value_changes_along() -> None:
+    model = make_model([0] * 4, [1] * 4, points=4, n_actions=2)
+    assert telling_dims(model) == (0, 1)
+    fill(model, lambda points: np.stack([points @ [0.1, 3.0, 0.0, 2.0]] * 2, axis=1))
+    assert telling_dims(model) == (1, 3)
+    assert telling_dims(make_model([0, 0], [1, 1])) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"dims": (0, 3)}, r"dims must be two different dimensions of 0 to 2; got \(0, 3\)"),
+        ({"dims": (1, 1)}, "dims must be two different"),
+        ({"dims": (0, -1)}, "dims must be two different"),
+        ({"dims": (0, 1, 2)}, "dims must be two different"),
+        ({"fixed": {1: 0.5}}, r"fixed must name dimensions .* other than those drawn, \(0, 1\); got {1: 0.5}"),
+        ({"fixed": {7: 0.5}}, "fixed must name dimensions"),
+        ({"resolution": 0}, "resolution must be at least 1; got 0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        plot_value_function(make_model([0, 0, 0], [1, 1, 1], points=3), **arguments)
+
+
+@pytest.mark.parametrize("env", ["FrozenLake-v1", StillEnv([0], [1], spaces.Discrete(2))], ids=["states", "line"])
+def test_a_value_function_needs_two_dimensions(env: Any) -> None:
+    with pytest.raises(ValueError, match="two dimensions of a Box"):
+        plot_value_function(KNNTD(env))
+
+
+# --------------------------------------------------------------------- manners
+
+
+def test_no_window_and_no_global_state_is_touched() -> None:
+    program = (
+        "import sys, sb3_knntd.plots\n"
+        "assert 'matplotlib' not in sys.modules, 'imported before it is needed'\n"
+        "sb3_knntd.plots.plot_learning_curve([1, 2], [1, 2])\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
+    assert run.returncode == 0, run.stderr
+
+
+def test_the_example_draws_a_value_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "images" / "picture.png"
+    learn = KNNTD.learn
+    monkeypatch.setattr(KNNTD, "learn", lambda self, total_timesteps: learn(self, min(total_timesteps, 500)))
+    monkeypatch.setattr(sys, "argv", ["value_function.py", str(path)])
+    runpy.run_path(str(Path(__file__).parents[1] / "examples" / "value_function.py"), run_name="__main__")
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_settings_of_the_user_are_left_alone() -> None:
+    before = dict(matplotlib.rcParams)
+    plot_learning_curve([1, 2], [1.0, 2.0])
+    plot_value_function(make_model([0, 0], [1, 1]), resolution=5)
+    assert dict(matplotlib.rcParams) == before

@@ -1,0 +1,492 @@
+"""Nothing is lost: files hold the whole model, survive interruption, and are refused where they do not fit."""
+
+from __future__ import annotations
+
+import copy
+import io
+import os
+import pathlib
+import resource
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import DQN
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from toy_envs import DriftEnv, GridEnv
+
+from sb3_knntd import KNNTD
+
+MakeModel = Callable[..., KNNTD]
+MakeVenv = Callable[..., VecEnv]
+
+SCATTERED = np.random.default_rng(5).uniform(DriftEnv.LOW, DriftEnv.HIGH, size=(30, 2))
+# Each makes a model differ from the others in what has to be kept.
+SETTINGS: dict[str, dict[str, Any]] = {
+    "defaults": {},
+    "constant epsilon": {"exploration_initial_eps": 0.4, "exploration_final_eps": 0.4},
+    "softmax": {"exploration": "softmax", "temperature": LinearSchedule(1.0, 0.2, 1.0)},
+    "schedules": {"learning_rate": LinearSchedule(0.8, 0.1, 1.0), "trace_decay": LinearSchedule(0.3, 0.9, 1.0)},
+    "accumulating": {"traces": "accumulating", "step_size": "paper", "trace_decay": 0.8, "learning_rate": 0.1},
+    "greedy, random ties": {"exploration_initial_eps": 0.0, "tie_break": "random"},
+    "first ties": {"exploration_initial_eps": 0.1, "tie_break": "first"},
+    "q_learning": {"target": "q_learning", "exploration_initial_eps": 0.3},
+    "expected_sarsa": {"target": "expected_sarsa", "exploration_initial_eps": 0.3},
+    "scattered": {"points": SCATTERED},
+    "half size": {"policy_kwargs": {"dtype": th.float32}},
+    "own weights": {"weights": lambda d2: (1.0 + d2) ** -2},
+    "no seed": {"seed": None},
+}
+
+
+def same_table(first: KNNTD, second: KNNTD) -> bool:
+    return th.equal(first.policy.q_table, second.policy.q_table)
+
+
+def go_on(path: pathlib.Path, venv: VecEnv, n_steps: int) -> KNNTD:
+    """Load, and learn on from where it was in an environment that is still in the state it was in."""
+    return KNNTD.load(path, env=venv, force_reset=False).learn(n_steps, reset_num_timesteps=False)
+
+
+# ------------------------------------------------------------ what is kept
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_interrupted_run_equals_the_uninterrupted(
+    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, settings: dict[str, Any], n_envs: int
+) -> None:
+    # Odd numbers, so that episodes are under way in all environments.
+    whole = make_model(make_venv(n_envs), **settings)
+    whole.save(tmp_path / "start")
+    whole.learn(101).learn(101, reset_num_timesteps=False)
+
+    venv = make_venv(n_envs)
+    # Both begin with the same random state also where no seed was given.
+    KNNTD.load(tmp_path / "start", env=venv).learn(101).save(tmp_path / "middle")
+    resumed = go_on(tmp_path / "middle", venv, 101)
+    assert same_table(resumed, whole)
+    assert resumed.num_timesteps == whole.num_timesteps
+    assert resumed.exploration_rate == whole.exploration_rate
+    assert resumed.policy.q_table.count_nonzero() > 50, "too little was learned for a comparison"
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("env_id", ["MountainCar-v0", "FrozenLake-v1"])
+def test_interrupted_run_in_environments_with_chance(tmp_path: pathlib.Path, env_id: str, n_envs: int) -> None:
+    def make() -> VecEnv:
+        return make_vec_env(lambda: gym.make(env_id, max_episode_steps=30), n_envs)
+
+    arguments: dict[str, Any] = {"points": (6, 6), "n_neighbors": 4} if env_id == "MountainCar-v0" else {}
+    whole = KNNTD(make(), seed=3, **arguments).learn(110).learn(110, reset_num_timesteps=False)
+    venv = make()
+    KNNTD(venv, seed=3, **arguments).learn(110).save(tmp_path / "middle")
+    assert same_table(go_on(tmp_path / "middle", venv, 110), whole)
+
+
+@pytest.mark.parametrize("first", [300, 1200])
+def test_interrupted_while_and_after_measuring(tmp_path: pathlib.Path, first: int) -> None:
+    def make() -> VecEnv:
+        return make_vec_env("CartPole-v1", 1)
+
+    arguments: dict[str, Any] = {"points": 3, "n_neighbors": 4, "seed": 1}
+    whole = KNNTD(make(), **arguments).learn(first).learn(1400 - first, reset_num_timesteps=False)
+    venv = make()
+    KNNTD(venv, **arguments).learn(first).save(tmp_path / "middle")
+    resumed = go_on(tmp_path / "middle", venv, 1400 - first)
+    assert same_table(resumed, whole)
+    assert resumed.policy.q_table.any()
+    assert th.equal(resumed.policy.points, whole.policy.points)
+
+
+def test_interrupted_run_in_normalised_environments(
+    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
+) -> None:
+    bounds = ([-2.0, -2.0], [2.0, 2.0])
+    whole = make_model(VecNormalize(make_venv(2)), bounds=bounds).learn(100).learn(100, reset_num_timesteps=False)
+    venv = VecNormalize(make_venv(2))
+    make_model(venv, bounds=bounds).learn(100).save(tmp_path / "middle")
+    resumed = go_on(tmp_path / "middle", venv, 100)
+    assert same_table(resumed, whole)
+
+
+def test_saving_is_an_observer(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+    saving = make_model().learn(100)
+    saving.save(tmp_path / "seen")
+    saving.learn(100, reset_num_timesteps=False)
+    assert same_table(saving, make_model().learn(100).learn(100, reset_num_timesteps=False))
+
+
+class Snapshot(BaseCallback):
+    """Copies the environments after so many calls, for a run that goes on from the checkpoint of that step."""
+
+    def __init__(self, at: int) -> None:
+        super().__init__()
+        self.at = at
+        self.venv: Any = None
+
+    def _on_step(self) -> bool:
+        if self.n_calls == self.at:
+            self.venv = copy.deepcopy(self.training_env)
+        return True
+
+
+# Episodes have 9, 14 and 6 steps, so that the first of the three is the last step of an episode.
+@pytest.mark.parametrize("at", [29, 100, 120])
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("learning_rate", [0.3, LinearSchedule(0.9, 0.0, 1.0), lambda progress: 0.5 * progress**2])
+def test_checkpoint_in_the_middle_of_learn(
+    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, learning_rate: Any, n_envs: int, at: int
+) -> None:
+    arguments = {"learning_rate": learning_rate, "exploration_fraction": 1.0, "exploration_initial_eps": 0.5}
+    total = 240 * n_envs
+    snapshot = Snapshot(at)
+    checkpoints = CheckpointCallback(save_freq=at, save_path=str(tmp_path))
+    whole = make_model(make_venv(n_envs), **arguments).learn(total, callback=CallbackList([checkpoints, snapshot]))
+
+    done = at * n_envs
+    resumed = go_on(tmp_path / f"rl_model_{done}_steps", snapshot.venv, total - done)
+    assert resumed.num_timesteps == whole.num_timesteps == total
+    assert same_table(resumed, whole)
+    # It is not equal for want of anything to learn after the checkpoint.
+    assert not same_table(whole, KNNTD.load(tmp_path / f"rl_model_{done}_steps"))
+
+
+@pytest.mark.parametrize("at", [29, 100])
+def test_checkpoint_keeps_the_counters_of_the_log(
+    make_model: MakeModel, make_venv: MakeVenv, read_log: Callable[..., Any], tmp_path: pathlib.Path, at: int
+) -> None:
+    def last_row(name: str) -> dict[str, float]:
+        row = read_log(tmp_path / name)[-1]
+        return {key: value for key, value in row.items() if key not in ("time/fps", "time/time_elapsed")}
+
+    snapshot = Snapshot(at)
+    whole = make_model(make_venv())
+    whole.set_logger(configure(str(tmp_path / "whole"), ["csv"]))
+    checkpoints = CheckpointCallback(save_freq=at, save_path=str(tmp_path))
+    whole.learn(160, callback=[checkpoints, snapshot], log_interval=1)
+
+    resumed = KNNTD.load(tmp_path / f"rl_model_{at}_steps", env=snapshot.venv, force_reset=False)
+    resumed.set_logger(configure(str(tmp_path / "resumed"), ["csv"]))
+    resumed.learn(160 - at, reset_num_timesteps=False, log_interval=1)
+    assert last_row("resumed") == last_row("whole")
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_loaded_model_predicts_the_same(
+    make_model: MakeModel, observations: np.ndarray, tmp_path: pathlib.Path, settings: dict[str, Any]
+) -> None:
+    model = make_model(**settings).learn(150)
+    model.save(tmp_path / "model")
+    loaded = KNNTD.load(tmp_path / "model")
+    assert same_table(loaded, model)
+    assert loaded.policy.q_table.dtype == model.policy.q_table.dtype
+    assert th.equal(loaded.policy.points, model.policy.points)
+    assert th.equal(loaded.policy.q_values(observations), model.policy.q_values(observations))
+    for kept, given in zip(loaded.policy.perceive(observations), model.policy.perceive(observations), strict=True):
+        assert th.equal(kept, given)
+    assert np.array_equal(
+        loaded.predict(observations, deterministic=True)[0], model.predict(observations, deterministic=True)[0]
+    )
+
+
+def test_measured_ranges_are_kept_without_the_environment(make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+    # Nothing but the file knows of the normalisation that the ranges were measured under.
+    venv = VecNormalize(make_venv(2))
+    model = KNNTD(venv, points=5, seed=0).learn(1200)
+    model.save(tmp_path / "model")
+    loaded = KNNTD.load(tmp_path / "model")
+    seen = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
+    assert th.equal(loaded.policy.points, model.policy.points)
+    assert th.equal(loaded.policy.q_values(seen), model.policy.q_values(seen))
+    assert model.policy.q_values(seen).count_nonzero() > 20
+
+
+@pytest.mark.parametrize("kind", ["discrete", "multi_discrete"])
+def test_exact_tables_are_kept(tmp_path: pathlib.Path, kind: str) -> None:
+    model = KNNTD(GridEnv(kind), seed=0).learn(150)
+    model.save(tmp_path / "model")
+    loaded = KNNTD.load(tmp_path / "model")
+    assert same_table(loaded, model)
+    states = model.policy.points.numpy().squeeze().astype(np.int64)
+    assert np.array_equal(loaded.predict(states, deterministic=True)[0], model.predict(states, deterministic=True)[0])
+
+
+def test_arguments_are_kept(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+    given = {
+        "learning_rate": 0.2, "gamma": 0.9, "trace_decay": 0.7, "n_neighbors": 3, "points": [5, 4], "bandwidth": 0.5,
+        "weights": "gaussian", "search": "brute", "step_size": "paper", "traces": "accumulating",
+        "reset_other_actions": False, "target": "q_learning", "exploration": "softmax", "temperature": 0.5,
+        "exploration_initial_eps": 0.3, "exploration_final_eps": 0.2, "exploration_fraction": 0.9,
+        "tie_break": "first", "initial_value": 2.0, "verbose": 0, "seed": 7,
+    }  # fmt: skip
+    make_model(**given).save(tmp_path / "model")
+    loaded = KNNTD.load(tmp_path / "model")
+    assert {name: getattr(loaded, name) for name in given} == given
+    assert (loaded.policy.q_table == 2.0).all()
+
+
+# ------------------------------------------------------- going on elsewhere
+
+
+@pytest.mark.parametrize(("saved", "loaded"), [(1, 3), (3, 1), (2, 4)])
+def test_other_number_of_environments(
+    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, saved: int, loaded: int
+) -> None:
+    model = make_model(make_venv(saved)).learn(100)
+    model.save(tmp_path / "model")
+    other = KNNTD.load(tmp_path / "model", env=make_venv(loaded))
+    assert same_table(other, model)
+    assert other.n_envs == loaded
+    other.learn(90, reset_num_timesteps=False)
+    assert other.num_timesteps >= model.num_timesteps + 90
+    assert not same_table(other, model)
+    assert th.isfinite(other.policy.q_table).all()
+
+
+def test_other_number_of_environments_cannot_be_in_the_same_state(
+    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
+) -> None:
+    make_model(make_venv(1)).learn(100).save(tmp_path / "model")
+    # There is no state to go on from in three environments, and a load is all it takes to go on in others: so
+    # new episodes begin, as if a reset had been asked for.
+    model = KNNTD.load(tmp_path / "model", env=make_venv(3), force_reset=False)
+    model.learn(90, reset_num_timesteps=False)
+    assert model.num_timesteps == 190
+    assert th.isfinite(model.policy.q_table).all()
+
+
+def test_load_without_environment_then_set_one(
+    make_model: MakeModel, make_venv: MakeVenv, observations: np.ndarray, tmp_path: pathlib.Path
+) -> None:
+    model = make_model().learn(100)
+    model.save(tmp_path / "model")
+    loaded = KNNTD.load(tmp_path / "model")
+    assert loaded.get_env() is None
+    assert np.array_equal(loaded.predict(observations)[0], model.predict(observations)[0])
+    with pytest.raises(ValueError, match="set_env"):
+        loaded.learn(100)
+    loaded.set_env(make_venv())
+    loaded.learn(100, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 200
+    assert not same_table(loaded, model)
+
+
+def test_reset_on_load_starts_new_episodes(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+    venv = make_venv()
+    # The first episode has 9 steps, and 14 the second.
+    make_model(venv).learn(4).save(tmp_path / "model")
+    resumed = KNNTD.load(tmp_path / "model", env=venv)
+    resumed.learn(14, reset_num_timesteps=False)
+    assert [info["l"] for info in resumed.ep_info_buffer or ()] == [14]
+
+
+@pytest.mark.parametrize("as_text", [True, False])
+@pytest.mark.parametrize(("name", "written"), [("mc", "mc.zip"), ("mc.zip", "mc.zip"), ("sub/folder/mc", None)])
+def test_paths(make_model: MakeModel, tmp_path: pathlib.Path, name: str, written: str | None, as_text: bool) -> None:
+    path: Any = str(tmp_path / name) if as_text else tmp_path / name
+    model = make_model().learn(20)
+    model.save(path)
+    assert (tmp_path / (written or f"{name}.zip")).is_file()
+    assert same_table(KNNTD.load(path), model)
+
+
+def test_file_objects(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+    model = make_model().learn(20)
+    memory = io.BytesIO()
+    model.save(memory)
+    memory.seek(0)
+    assert same_table(KNNTD.load(memory), model)
+    with open(tmp_path / "model.zip", "wb") as file:
+        model.save(file)
+    with open(tmp_path / "model.zip", "rb") as file:
+        assert same_table(KNNTD.load(file), model)
+
+
+def test_attributes_are_changed_on_load(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+    make_model().learn(20).save(tmp_path / "model")
+    model = KNNTD.load(tmp_path / "model", env=make_venv(), learning_rate=0.0, verbose=0)
+    before = model.policy.q_table.clone()
+    model.learn(50)
+    assert th.equal(model.policy.q_table, before)
+    replaced = KNNTD.load(tmp_path / "model", custom_objects={"gamma": 0.5}, print_system_info=True)
+    assert replaced.gamma == 0.5
+
+
+def test_file_can_be_read_by_whom_the_umask_lets(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+    umask = os.umask(0o022)
+    try:
+        make_model().save(tmp_path / "model")
+    finally:
+        os.umask(umask)
+    assert (tmp_path / "model.zip").stat().st_mode & 0o777 == 0o644
+
+
+# ------------------------------------------------------------- interruption
+
+
+def interrupt(*args: Any, **kwargs: Any) -> Any:
+    raise KeyboardInterrupt
+
+
+@pytest.fixture
+def saved(make_model: MakeModel, tmp_path: pathlib.Path) -> pathlib.Path:
+    """A file with a model that has learned 100 steps, alone in its folder."""
+    path = tmp_path / "saved" / "model.zip"
+    make_model().learn(100).save(path)
+    return path
+
+
+def check_untouched(path: pathlib.Path, before: bytes) -> None:
+    assert [file.name for file in path.parent.iterdir()] == [path.name], "something was left behind"
+    assert path.read_bytes() == before
+    assert KNNTD.load(path).num_timesteps == 100
+
+
+@pytest.mark.parametrize(
+    ("module", "function"),
+    [(os, "fsync"), (os, "replace"), (zipfile.ZipFile, "writestr"), (th, "save")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_interrupted_save_leaves_the_previous_file(
+    saved: pathlib.Path, monkeypatch: pytest.MonkeyPatch, module: Any, function: str
+) -> None:
+    before = saved.read_bytes()
+    model = KNNTD.load(saved, learning_rate=0.7)
+    with monkeypatch.context() as patched:
+        patched.setattr(module, function, interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            model.save(saved)
+    check_untouched(saved, before)
+    # And the next one succeeds.
+    model.save(saved)
+    assert KNNTD.load(saved).learning_rate == 0.7
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999])
+def test_disk_that_is_full_at_some_byte_leaves_the_previous_file(saved: pathlib.Path, share: float) -> None:
+    before = saved.read_bytes()
+    model = KNNTD.load(saved, learning_rate=0.7)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(before)), hard))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            model.save(saved)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    check_untouched(saved, before)
+
+
+def test_first_save_interrupted_leaves_nothing(
+    make_model: MakeModel, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = make_model()
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        model.save(tmp_path / "model")
+    assert not list(tmp_path.iterdir())
+
+
+# ------------------------------------------------------------------ refusal
+
+
+def test_missing_file(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        KNNTD.load(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99])
+def test_cut_off_file(saved: pathlib.Path, share: float) -> None:
+    whole = saved.read_bytes()
+    saved.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=r"model\.zip"):
+        KNNTD.load(saved)
+
+
+def test_file_without_its_last_byte(saved: pathlib.Path) -> None:
+    saved.write_bytes(saved.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"model\.zip"):
+        KNNTD.load(saved)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.7])
+def test_file_with_a_changed_byte(saved: pathlib.Path, share: float) -> None:
+    content = bytearray(saved.read_bytes())
+    content[int(share * len(content))] ^= 0xFF
+    saved.write_bytes(content)
+    with pytest.raises(ValueError, match=r"model\.zip"):
+        KNNTD.load(saved)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04", b"\x80\x04\x95"])
+def test_something_else_than_a_zip(tmp_path: pathlib.Path, content: bytes) -> None:
+    (tmp_path / "model.zip").write_bytes(content)
+    with pytest.raises(ValueError, match=r"model\.zip"):
+        KNNTD.load(tmp_path / "model.zip")
+
+
+@pytest.mark.parametrize("data", [None, b"", b"{", b"[1, 2]", b"\xff\xfe"])
+def test_zip_of_something_else(tmp_path: pathlib.Path, data: bytes | None) -> None:
+    with zipfile.ZipFile(tmp_path / "model.zip", "w") as archive:
+        archive.writestr("readme.txt", "holiday pictures")
+        if data is not None:
+            archive.writestr("data", data)
+    with pytest.raises(ValueError, match=r"model\.zip"):
+        KNNTD.load(tmp_path / "model.zip")
+
+
+@pytest.mark.parametrize("missing", [".pth", "data"])
+def test_zip_without_one_of_its_parts(saved: pathlib.Path, missing: str) -> None:
+    with zipfile.ZipFile(saved) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    # SB3 writes, and does not need, an empty file of variables.
+    names = [name for name in parts if name.endswith(missing) and name != "pytorch_variables.pth"]
+    assert names
+    for absent in names:
+        with zipfile.ZipFile(saved, "w") as archive:
+            for name in parts.keys() - {absent}:
+                archive.writestr(name, parts[name])
+        with pytest.raises(ValueError, match=r"model\.zip"):
+            KNNTD.load(saved)
+
+
+def test_file_of_another_algorithm(tmp_path: pathlib.Path) -> None:
+    DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "dqn")
+    with pytest.raises(ValueError, match="KNNTD"):
+        KNNTD.load(tmp_path / "dqn")
+
+
+def test_file_of_another_algorithm_is_not_unpickled(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "dqn")
+    monkeypatch.setattr("stable_baselines3.common.save_util.json_to_data", interrupt)
+    with pytest.raises(ValueError, match="KNNTD"):
+        KNNTD.load(tmp_path / "dqn")
+
+
+@pytest.mark.parametrize("env", ["MountainCar-v0", "Acrobot-v1", GridEnv()], ids=["Box", "larger Box", "Discrete"])
+def test_file_of_another_space(saved: pathlib.Path, env: Any) -> None:
+    other = gym.make(env) if isinstance(env, str) else env
+    with pytest.raises(ValueError, match=r"[Oo]bservation space"):
+        KNNTD.load(saved, env=other)
+
+
+def test_file_of_another_action_space(saved: pathlib.Path) -> None:
+    env = DriftEnv()
+    env.action_space = gym.spaces.Discrete(4)
+    with pytest.raises(ValueError, match=r"[Aa]ction space"):
+        KNNTD.load(saved, env=DummyVecEnv([lambda: env]))
+
+
+def test_refused_file_leaves_the_file(saved: pathlib.Path) -> None:
+    before = saved.read_bytes()
+    with pytest.raises(ValueError, match="space"):
+        KNNTD.load(saved, env=gym.make("Acrobot-v1"))
+    check_untouched(saved, before)

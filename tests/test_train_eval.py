@@ -1,0 +1,276 @@
+"""A model in use: making it, training it again, moving it to another environment, changing its parts."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from toy_envs import DriftEnv, GridEnv
+
+from sb3_knntd import KNNTD, KNNPolicy
+
+MakeModel = Callable[..., KNNTD]
+MakeVenv = Callable[..., VecEnv]
+
+
+# ------------------------------------------------------------------- making
+
+
+def test_every_way_of_calling_is_the_same() -> None:
+    def env() -> gym.Env[Any, Any]:
+        return gym.make("MountainCar-v0")
+
+    calls: list[Callable[..., KNNTD]] = [
+        lambda **kw: KNNTD("MountainCar-v0", **kw),
+        lambda **kw: KNNTD("KNNPolicy", env(), **kw),
+        lambda **kw: KNNTD("KNNPolicy", "MountainCar-v0", **kw),
+        lambda **kw: KNNTD(KNNPolicy, env(), **kw),
+        lambda **kw: KNNTD(policy="KNNPolicy", env=env(), **kw),
+        lambda **kw: KNNTD(env=env(), **kw),
+        lambda **kw: KNNTD(env="MountainCar-v0", **kw),
+        lambda **kw: KNNTD(env(), **kw),
+        lambda **kw: KNNTD(DummyVecEnv([env]), **kw),
+    ]
+    models = [call(seed=0, points=8, n_neighbors=4).learn(100) for call in calls]
+    assert isinstance(models[0], BaseAlgorithm)
+    assert models[0].policy.q_table.any()
+    for model in models[1:]:
+        assert type(model.policy) is KNNPolicy
+        assert th.equal(model.policy.q_table, models[0].policy.q_table)
+
+
+def test_calls_of_the_documentation() -> None:
+    env = gym.make("MountainCar-v0")
+    assert KNNTD("MountainCar-v0", seed=0).policy.points.shape[1] == 2
+    assert KNNTD("KNNPolicy", env).policy.q_table.shape[1] == 3
+    assert KNNTD(env=env, n_neighbors=4, points=(20, 15)).policy.points.shape == (300, 2)
+
+
+def test_points_are_in_observation_units() -> None:
+    points = KNNTD("MountainCar-v0", points=(20, 15)).policy.points.numpy()
+    np.testing.assert_allclose(points.min(axis=0), [-1.2, -0.07], rtol=1e-6)
+    np.testing.assert_allclose(points.max(axis=0), [0.6, 0.07], rtol=1e-6)
+    assert len(np.unique(points[:, 0].round(6))) == 20
+    assert len(np.unique(points[:, 1].round(6))) == 15
+
+
+def test_scattered_points_are_where_they_were_put() -> None:
+    places = np.random.default_rng(0).uniform([-1.2, -0.07], [0.6, 0.07], size=(30, 2))
+    np.testing.assert_allclose(KNNTD("MountainCar-v0", points=places).policy.points.numpy(), places)
+
+
+def test_device_auto(make_model: MakeModel) -> None:
+    model = make_model(device="auto").learn(20)
+    assert model.policy.q_table.device == model.device
+
+
+def test_learn_returns_the_model(make_model: MakeModel) -> None:
+    model = make_model()
+    assert model.learn(10) is model
+
+
+def test_initial_value(make_model: MakeModel) -> None:
+    assert (make_model(initial_value=-3.5).policy.q_table == -3.5).all()
+
+
+# ----------------------------------------------------------- training again
+
+
+def test_learning_on_keeps_counting_and_the_table(make_model: MakeModel) -> None:
+    model = make_model().learn(100)
+    table = model.policy.q_table.clone()
+    model.learn(0, reset_num_timesteps=False)
+    assert th.equal(model.policy.q_table, table)
+    model.learn(50, reset_num_timesteps=False)
+    assert model.num_timesteps == 150
+    assert not th.equal(model.policy.q_table, table)
+
+
+def test_learning_on_stays_in_the_episode(make_model: MakeModel) -> None:
+    # Nine steps is the first episode long, whatever calls they are spread over.
+    model = make_model().learn(4).learn(5, reset_num_timesteps=False)
+    assert [info["l"] for info in model.ep_info_buffer or ()] == [9]
+
+
+def test_learning_anew_counts_anew_in_new_episodes_with_the_same_table(make_model: MakeModel) -> None:
+    model = make_model(learning_rate=0.0, initial_value=2.0).learn(4)
+    model.policy.q_table[0, 0] = 5.0
+    model.learn(14)
+    assert model.num_timesteps == 14
+    assert [info["l"] for info in model.ep_info_buffer or ()] == [14]
+    assert model.policy.q_table[0, 0] == 5.0
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_traces_do_not_outlive_a_reset(make_venv: MakeVenv, n_envs: int) -> None:
+    # With λ = γ = 1 whatever was visited since the traces began is credited with every error.
+    venv = DummyVecEnv([lambda: GridEnv(lengths=[100])] * n_envs)
+    model = KNNTD(venv, gamma=1.0, trace_decay=1.0, learning_rate=0.5, exploration_initial_eps=0.0, tie_break="first")
+    model.learn(3 * n_envs)
+    before = model.policy.q_table.clone()
+    first_episode = before.any(dim=1)
+    model.learn(1 * n_envs)
+    changed = (model.policy.q_table != before).any(dim=1)
+    assert int(first_episode.sum()) == 3
+    # One step of the second episode changes one state.
+    assert int(changed.sum()) == 1
+
+
+# ------------------------------------------------------ environments and seeds
+
+
+def test_get_and_set_env(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    first, second = make_venv(), make_venv()
+    model = make_model(first).learn(30)
+    assert model.get_env() is first
+    model.set_env(second)
+    assert model.get_env() is second
+    # The new environment is in its first episode, of nine steps.
+    model.learn(9, reset_num_timesteps=False)
+    assert model.num_timesteps == 39
+    assert [info["l"] for info in model.ep_info_buffer or ()][-1] == 9
+
+
+def test_set_env_wraps(make_model: MakeModel) -> None:
+    model = make_model()
+    model.set_env(DriftEnv())
+    assert isinstance(model.get_env(), VecEnv)
+    assert model.learn(20).num_timesteps == 20
+
+
+def test_set_env_refuses_what_does_not_fit(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    model = make_model()
+    with pytest.raises(ValueError, match="space"):
+        model.set_env(GridEnv())
+    with pytest.raises(AssertionError, match="number of environments"):
+        model.set_env(make_venv(2))
+
+
+def test_env_is_made_from_its_id(make_model: MakeModel) -> None:
+    model = KNNTD("CliffWalking-v1", seed=0)
+    venv = model.get_env()
+    assert isinstance(venv, VecEnv)
+    assert venv.num_envs == 1
+    assert model.learn(50).num_timesteps == 50
+
+
+def test_model_without_environment_is_made_but_not_built() -> None:
+    model = KNNTD("KNNPolicy", env=None, _init_setup_model=False)
+    assert model.get_env() is None
+
+
+def test_building_without_environment_says_what_is_missing() -> None:
+    with pytest.raises(ValueError, match="env"):
+        KNNTD()
+
+
+def test_set_random_seed_seeds_the_spaces(make_model: MakeModel) -> None:
+    model = make_model()
+    draws = []
+    for _ in range(2):
+        model.set_random_seed(11)
+        draws.append([model.action_space.sample() for _ in range(10)] + list(np.random.random(3)))
+    assert draws[0] == draws[1]
+
+
+@pytest.mark.parametrize("seed", [0, None])
+def test_set_random_seed_may_be_called_at_any_time(make_model: MakeModel, seed: int | None) -> None:
+    model = make_model().learn(30)
+    model.set_random_seed(seed)
+    assert model.learn(30, reset_num_timesteps=False).num_timesteps == 60
+
+
+def test_set_logger(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+    logger = configure(str(tmp_path), ["csv"])
+    model = make_model()
+    model.set_logger(logger)
+    model.learn(60)
+    assert model.logger is logger
+    assert (tmp_path / "progress.csv").stat().st_size > 0
+
+
+# --------------------------------------------------------------- parameters
+
+
+def test_parameters_go_from_model_to_model(make_model: MakeModel, observations: np.ndarray) -> None:
+    learned, other = make_model().learn(150), make_model(seed=1)
+    assert not th.equal(other.policy.q_table, learned.policy.q_table)
+    other.set_parameters(learned.get_parameters())
+    assert th.equal(other.policy.q_table, learned.policy.q_table)
+    assert th.equal(other.policy.q_values(observations), learned.policy.q_values(observations))
+    # It is a copy: what the one learns from now on is not the other's.
+    other.learn(50)
+    assert not th.equal(other.policy.q_table, learned.policy.q_table)
+
+
+def test_parameters_go_through_a_file(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+    learned, other = make_model().learn(150), make_model(seed=1)
+    learned.save(tmp_path / "model")
+    other.set_parameters(str(tmp_path / "model"), device="cpu")
+    assert th.equal(other.policy.q_table, learned.policy.q_table)
+
+
+def test_parameters_hold_the_ranges(observations: np.ndarray) -> None:
+    measured, other = (KNNTD("CartPole-v1", points=3, n_neighbors=2, seed=seed) for seed in (0, 1))
+    measured.learn(1050)
+    other.set_parameters(measured.get_parameters())
+    assert th.equal(other.policy.points, measured.policy.points)
+    places = np.float32([[0.1, 0.2, 0.05, -0.3]])
+    assert th.equal(other.policy.q_values(places), measured.policy.q_values(places))
+
+
+def test_parameters_that_do_not_fit_are_refused(make_model: MakeModel) -> None:
+    model = make_model()
+    parameters = model.get_parameters()
+    with pytest.raises(ValueError, match="Names of parameters"):
+        model.set_parameters({})
+    with pytest.raises(ValueError, match="invalid object name"):
+        model.set_parameters({**parameters, "no_such_part": {}})
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        model.set_parameters(make_model(points=(3, 3)).get_parameters())
+
+
+def test_parameters_are_tensors_only(make_model: MakeModel) -> None:
+    # What travels needs no code to be read: th.load(weights_only=True) takes it.
+    def leaves(value: Any) -> list[Any]:
+        return [leaf for part in value.values() for leaf in leaves(part)] if isinstance(value, dict) else [value]
+
+    parameters = leaves(make_model().get_parameters())
+    assert parameters
+    assert all(isinstance(parameter, th.Tensor) for parameter in parameters)
+
+
+# --------------------------------------------------------------- evaluation
+
+
+def test_evaluate_policy_equals_a_loop_by_hand(make_model: MakeModel) -> None:
+    model = make_model().learn(200)
+    env = DriftEnv()
+    by_hand = []
+    for _ in range(3):
+        observation, _ = env.reset()
+        total, done = 0.0, False
+        while not done:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            total, done = total + reward, terminated or truncated
+        by_hand.append(total)
+    mean, _ = evaluate_policy(model, DriftEnv(), n_eval_episodes=3, deterministic=True, warn=False)
+    assert mean == pytest.approx(np.mean(by_hand), rel=1e-5)
+
+
+def test_evaluation_in_between_changes_nothing_that_is_learned(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    model = make_model().learn(60)
+    evaluate_policy(model, make_venv(), n_eval_episodes=3)
+    model.learn(60, reset_num_timesteps=False)
+    undisturbed = make_model().learn(60).learn(60, reset_num_timesteps=False)
+    assert th.equal(model.policy.q_table, undisturbed.policy.q_table)

@@ -1,0 +1,227 @@
+"""Vectorised environments of every kind, one environment in them or many."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
+from toy_envs import DriftEnv, GridEnv
+
+from sb3_knntd import KNNTD
+
+MakeModel = Callable[..., KNNTD]
+MakeVenv = Callable[..., VecEnv]
+
+
+def check_learned(model: KNNTD, n_steps: int) -> None:
+    assert model.num_timesteps == n_steps
+    assert model.policy.q_table.any()
+    assert th.isfinite(model.policy.q_table).all()
+
+
+@pytest.mark.parametrize(
+    ("vec_env_cls", "n_envs"),
+    [(DummyVecEnv, 1), (DummyVecEnv, 2), (DummyVecEnv, 5), (SubprocVecEnv, 1), (SubprocVecEnv, 2)],
+)
+def test_learn_and_evaluate(make_model: MakeModel, make_venv: MakeVenv, vec_env_cls: Any, n_envs: int) -> None:
+    venv = make_venv(n_envs, vec_env_cls)
+    model = make_model(venv).learn(40 * n_envs)
+    check_learned(model, 40 * n_envs)
+    assert np.isfinite(evaluate_policy(model, venv, n_eval_episodes=3, warn=False)[0])
+
+
+def test_steps_are_counted_over_all_environments(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    # The last round of steps is made whole, as in SB3.
+    assert make_model(make_venv(4)).learn(50).num_timesteps == 52
+
+
+@pytest.mark.parametrize("n_envs", [1, 7])
+def test_schedules_stay_within_the_run(make_model: MakeModel, make_venv: MakeVenv, n_envs: int) -> None:
+    asked: list[float] = []
+
+    def schedule(progress: float) -> float:
+        asked.append(progress)
+        return 0.3
+
+    make_model(make_venv(n_envs), learning_rate=schedule).learn(100)
+    assert max(asked) <= 1.0
+    # Seven environments overshoot a hundred steps; what is asked for beyond the end is the end.
+    assert min(asked) >= 0.0
+
+
+def test_learning_rate_falling_to_nothing_never_is_negative(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    # One step of each of 50 environments, of 10 asked for: the progress that remains would be -4.
+    model = make_model(make_venv(50), learning_rate=lambda progress: progress, initial_value=0.0)
+    model.learn(10)
+    assert not model.policy.q_table.any()
+
+
+def test_environments_share_one_table(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    model = make_model(make_venv(6)).learn(6)
+    # Six first steps, each from another place: more points are learned at than one step reaches.
+    assert int(model.policy.q_table.any(dim=1).sum()) > 4
+
+
+def test_many_equal_environments_learn_as_stably_as_one(make_model: MakeModel) -> None:
+    settings = {"exploration_initial_eps": 0.0, "tie_break": "first"}
+    one = make_model(DummyVecEnv([DriftEnv]), **settings).learn(60)
+    # Sixty-four times the same must not be a step sixty-four times as large.
+    many = make_model(DummyVecEnv([DriftEnv] * 64), **settings).learn(60 * 64)
+    th.testing.assert_close(many.policy.q_table, one.policy.q_table)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_frame_stack(make_venv: MakeVenv, n_envs: int) -> None:
+    venv = VecFrameStack(make_venv(n_envs), n_stack=2)
+    low, high = np.tile(DriftEnv.LOW, 2), np.tile(DriftEnv.HIGH, 2)
+    model = KNNTD(venv, points=4, bounds=(low, high), seed=0).learn(60 * n_envs)
+    check_learned(model, 60 * n_envs)
+    assert model.policy.points.shape == (4**4, 4)
+    assert model.predict(venv.reset())[0].shape == (n_envs,)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_monitor(make_model: MakeModel, n_envs: int) -> None:
+    model = make_model(VecMonitor(DummyVecEnv([DriftEnv] * n_envs))).learn(30 * n_envs)
+    check_learned(model, 30 * n_envs)
+    assert [info["l"] for info in model.ep_info_buffer or ()] == [9] * n_envs + [14] * n_envs + [6] * n_envs
+
+
+def test_check_nan(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    check_learned(make_model(VecCheckNan(make_venv(2), raise_exception=True)).learn(60), 60)
+
+
+# -------------------------------------------------------------- VecNormalize
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_normalised_observations_are_measured(make_venv: MakeVenv, n_envs: int) -> None:
+    venv = VecNormalize(make_venv(n_envs))
+    model = KNNTD(venv, points=5, seed=0).learn(1300)
+    check_learned(model, 1300 + -1300 % n_envs)
+    assert model.get_vec_normalize_env() is venv
+    # The space speaks of ±3 and ±1, and of what was divided by its spread: the points go by what was seen.
+    seen = [venv.reset()]
+    for _ in range(30):
+        seen.append(venv.step(np.full(n_envs, 1))[0])
+    low, high = model.policy.points.amin(dim=0).numpy(), model.policy.points.amax(dim=0).numpy()
+    inside = np.mean((np.concatenate(seen) >= low) & (np.concatenate(seen) <= high))
+    assert inside > 0.9
+    assert (high - low < 12).all()
+
+
+def test_normalised_rewards_alone_leave_the_space_its_range(make_venv: MakeVenv) -> None:
+    venv = VecNormalize(make_venv(), norm_obs=False)
+    model = KNNTD(venv, points=5, seed=0)
+    points = model.policy.points.clone()
+    model.learn(60)
+    check_learned(model, 60)
+    assert th.equal(model.policy.points, points)
+    np.testing.assert_allclose(points.amax(dim=0).numpy(), [3.0, 1.0])
+
+
+def test_given_bounds_are_those_of_normalised_observations(make_venv: MakeVenv) -> None:
+    model = KNNTD(VecNormalize(make_venv()), points=5, bounds=([-2, -2], [2, 2]), seed=0).learn(60)
+    check_learned(model, 60)
+    np.testing.assert_allclose(model.policy.points.amax(dim=0).numpy(), [2.0, 2.0])
+
+
+def test_truncation_bootstraps_from_the_normalised_last_observation() -> None:
+    # At a truncation that is its whole episode, r + γ Q(s') is all there is to learn; Q(s') = 10 everywhere.
+    venv = VecNormalize(make_vec_env(lambda: DriftEnv(lengths=[1], ends=["truncated"]), 1), norm_reward=False)
+    model = KNNTD(
+        venv, points=1, bounds=([-2, -2], [2, 2]), n_neighbors=1, learning_rate=1.0, gamma=0.5, initial_value=10.0
+    )
+    rewards: list[float] = []
+    model.learn(1, callback=lambda local, _: rewards.append(float(local["rewards"][0])) or True)
+    assert float(model.policy.q_table.min()) == pytest.approx(rewards[0] + 5.0)
+
+
+def test_normalisation_is_saved_beside(make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+    venv = VecNormalize(make_venv(2))
+    model = KNNTD(venv, points=5, seed=0).learn(1200)
+    model.save(tmp_path / "model")
+    venv.save(str(tmp_path / "normalize.pkl"))
+
+    again = VecNormalize.load(str(tmp_path / "normalize.pkl"), make_venv(2))
+    loaded = KNNTD.load(tmp_path / "model", env=again)
+    assert th.equal(loaded.policy.points, model.policy.points)
+    places = np.float32([[0.0, 0.0], [0.3, -0.01], [-0.8, 0.02]])
+    normalised = venv.normalize_obs(places)
+    assert np.array_equal(again.normalize_obs(places), normalised)
+    assert th.equal(loaded.policy.q_values(normalised), model.policy.q_values(normalised))
+    loaded.learn(100, reset_num_timesteps=False)
+    # The ranges have been measured, once and for all.
+    assert th.equal(loaded.policy.points, model.policy.points)
+    assert not th.equal(loaded.policy.q_table, model.policy.q_table)
+
+
+# ----------------------------------------------------- episodes and their ends
+
+
+def test_end_of_one_environment_leaves_the_others(make_model: MakeModel) -> None:
+    def venv() -> VecEnv:
+        # Two far corners, so that the environments meet at no point; the first ends at every step.
+        return DummyVecEnv(
+            [lambda: Still([-0.9, -0.04], length=1), lambda: Still([0.4, 0.05], length=100)],
+        )
+
+    settings = {"exploration_initial_eps": 0.0, "tie_break": "first", "gamma": 0.9}
+    both = make_model(venv(), **settings).learn(40)
+    alone = make_model(DummyVecEnv([lambda: Still([0.4, 0.05], length=100)]), **settings).learn(20)
+    place = np.float32([0.4, 0.05])
+    th.testing.assert_close(both.policy.q_values(place), alone.policy.q_values(place))
+    assert alone.policy.q_values(place).any()
+
+
+class Still(gym.Env[Any, Any]):
+    """Stays where it is, at a reward of 1 a step."""
+
+    def __init__(self, place: list[float], length: int) -> None:
+        self.place = np.array(place, dtype=np.float32)
+        self.length = length
+        self.observation_space = DriftEnv().observation_space
+        self.action_space = spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.elapsed = 0
+        return self.place, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.elapsed += 1
+        return self.place, 1.0, self.elapsed >= self.length, False, {}
+
+
+@pytest.mark.parametrize(("end", "value"), [("terminated", 1.0), ("truncated", 1.0 + 0.5 * 10.0)])
+def test_value_at_the_end_of_an_episode(end: str, value: float) -> None:
+    env = gym.wrappers.TransformReward(DriftEnv(lengths=[1], ends=[end]), lambda _: 1.0)
+    model = KNNTD(env, points=1, n_neighbors=1, learning_rate=1.0, gamma=0.5, initial_value=10.0).learn(1)
+    assert float(model.policy.q_table.min()) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("kind", ["discrete", "multi_discrete"])
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_exact_tables_of_many_environments(vec_env_cls: Any, kind: str) -> None:
+    venv = vec_env_cls([lambda: Monitor(GridEnv(kind))] * 2)
+    try:
+        check_learned(KNNTD(venv, seed=0).learn(100), 100)
+    finally:
+        venv.close()
