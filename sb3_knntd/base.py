@@ -44,33 +44,7 @@ class KNNAlgorithm(BaseAlgorithm):
     """
     What the algorithms of this package share: spaces, parameters, the learning loop, saving and loading.
 
-    :param policy: ``"KNNPolicy"``, a subclass of :class:`~sb3_knntd.policies.KNNPolicy`, or, as there is
-        nothing to choose from, the environment
-    :param env: the environment (a gymnasium id, an environment, or a VecEnv)
-    :param learning_rate: α, or a function of the remaining progress (from 1 to 0)
-    :param gamma: γ, in [0, 1]
-    :param trace_decay: λ, in [0, 1], or a function of the remaining progress
-    :param n_neighbors: k >= 1, or ``"auto"``
-    :param points: ``"auto"``, an int, one int a dimension, or an array (n_points, obs_dim) in observation units
-    :param bounds: the range mapped to [-1, 1]: ``None`` or (low, high), arrays (obs_dim,) in observation units
-    :param weights: ``"inverse_quadratic"`` (eq. 5), ``"gaussian"``, or a function from squared distances
-        (batch, k) to weights (batch, k)
-    :param bandwidth: h of the weights, > 0, scaled units
-    :param search: ``"auto"``, ``"brute"``
-    :param step_size: ``"paper"`` (α as in eq. 13) or ``"normalized"`` (α / Σp², so that α is the share of the
-        TD error that one update removes)
-    :param traces: ``"replacing"`` (eq. 16) or ``"accumulating"`` (eq. 15)
-    :param reset_other_actions: whether a replacing trace clears those of the other actions (Algorithm 3, line 16)
-    :param tie_break: ``"random"`` or ``"first"``: which of several equal best actions is taken while training
-    :param initial_value: Q at the start; above what is attainable it makes the learner explore
-    :param stats_window_size: number of episodes that the logged means are over
-    :param tensorboard_log: folder for TensorBoard, ``None`` for no log
-    :param policy_kwargs: ``{"dtype": torch.float32}`` for a table of half the size
-    :param verbose: 0 for no output, 1 for information, 2 for debugging
-    :param seed: seed of all random numbers
-    :param device: where perception and table are
-    :param _init_setup_model: whether to build the table at once
-    :raises ValueError: if an argument does not fit; the message says which, and what would
+    The parameters are those of :class:`~sb3_knntd.KNNTD`.
     """
 
     policy: KNNPolicy
@@ -234,6 +208,10 @@ class KNNAlgorithm(BaseAlgorithm):
             bounds_from_space=not normalizes,
             **self.policy_kwargs,
         ).to(self.device)
+        if self.verbose >= 1:
+            print(
+                f"Neighbours by search={self.policy.search_name!r} over {self.policy.perceiver.points.n_points} points"
+            )
         form = Form(
             self.gamma, self.step_size == "normalized", self.traces == "accumulating", bool(self.reset_other_actions)
         )

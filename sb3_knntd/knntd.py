@@ -22,6 +22,71 @@ SelfKNNTD = TypeVar("SelfKNNTD", bound="KNNTD")
 
 
 class KNNTD(KNNAlgorithm):
+    """
+    kNN-TD(λ): SARSA(λ) or Q(λ) over a table of action values at points of the observation space, each observation
+    being a weighted mean of its k nearest points.
+
+    Paper: Martin H., de Lope, Maravall, "Robust high performance reinforcement learning through weighted k-nearest
+    neighbors", Neurocomputing 74 (2011), https://doi.org/10.1016/j.neucom.2010.07.027. With ``trace_decay=0`` it is
+    kNN-TD (Algorithm 2), with ``n_neighbors=1`` besides NN-TD (Algorithm 1). On Discrete and MultiDiscrete
+    observations it is exact tabular SARSA(λ) or Q(λ).
+
+    .. code-block:: python
+
+        model = KNNTD("MountainCar-v0", seed=0).learn(20_000)
+        model.policy.q_table  # what it learned, at model.policy.points
+
+    :param policy: the environment, as there is no policy to choose; or, in SB3's order, ``"KNNPolicy"`` or a subclass
+        of :class:`~sb3_knntd.KNNPolicy`
+    :param env: the environment: a gymnasium id, an environment, or a VecEnv
+    :param learning_rate: α >= 0, or a function of the remaining progress (from 1 to 0); by default it falls linearly
+        from 0.5 to 0.05
+    :param gamma: γ, in [0, 1]
+    :param trace_decay: λ, in [0, 1], or a function of the remaining progress
+    :param n_neighbors: k >= 1; ``"auto"`` is 2 obs_dim + 1, a point and its neighbours along each axis, and 1 on
+        Discrete and MultiDiscrete observations
+    :param points: the perception points: an int or one int a dimension for a lattice over the bounds, or an array
+        (n_points, obs_dim) in observation units for scattered points; ``"auto"`` is a lattice of about 8000 points,
+        at most 20 in a dimension, or one point a state on Discrete and MultiDiscrete observations
+    :param bounds: the range mapped to [-1, 1]: (low, high), arrays (obs_dim,) in observation units; ``None`` takes the
+        space's, and finds a range for every dimension that has none in a random phase at the start of :meth:`learn`
+    :param weights: ``"inverse_quadratic"``: 1 / (1 + d²/h²), eq. 5; ``"gaussian"``: exp(-d²/2h²); or a function from
+        squared distances (batch, k), scaled units, to weights (batch, k), both torch tensors
+    :param bandwidth: h of the weights, > 0, scaled units (the bounds are 2 wide)
+    :param search: how neighbours are found, all exactly but ``"hnsw"``: ``"brute"``, ``"lattice"``, ``"kd_tree"``,
+        ``"hnsw"`` (approximate, extra ``[ann]``), or ``"auto"``
+    :param step_size: ``"paper"`` for α as in eq. 13, ``"normalized"`` for α / Σp², which makes α the share of the TD
+        error that one update removes
+    :param traces: ``"replacing"`` (eq. 16) or ``"accumulating"`` (eq. 15)
+    :param reset_other_actions: whether a replacing trace clears those of the other actions at its points (Algorithm
+        3, line 16)
+    :param target: ``"sarsa"`` (eq. 11), ``"q_learning"`` (eq. 12), or ``"expected_sarsa"``, the mean under the
+        exploration policy
+    :param exploration: ``"epsilon_greedy"`` or ``"softmax"``
+    :param exploration_initial_eps: ε at the start, in [0, 1]
+    :param exploration_final_eps: ε at the end, in [0, 1]
+    :param exploration_fraction: share of the training over which ε changes, in (0, 1]
+    :param temperature: of softmax, > 0, in units of return, or a function of the remaining progress
+    :param tie_break: which of several equal best actions is taken while training: ``"random"`` or ``"first"``
+    :param initial_value: Q at the start; above what is attainable it makes the learner explore
+    :param stats_window_size: number of episodes that the logged means are over
+    :param tensorboard_log: folder for TensorBoard, ``None`` for no log
+    :param policy_kwargs: ``dtype`` (``torch.float64`` or ``torch.float32``), ``table`` (``"auto"``, ``"dense"``,
+        ``"hashed"``) and ``compiled`` (``False`` for the torch reference), see :class:`~sb3_knntd.KNNPolicy`
+    :param verbose: 0 for no output, 1 for information, 2 for debugging
+    :param seed: seed of all random numbers
+    :param device: where perception and table are; on the CPU the step is compiled
+    :param _init_setup_model: whether to build the table at once
+    :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": KNNPolicy}
+    _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
+    _action_space_advice: ClassVar[str] = (
+        "For a Box of actions use ExA; MultiDiscrete and MultiBinary can be numbered into one Discrete space by "
+        "a gymnasium.ActionWrapper"
+    )
+
     def __init__(
         self,
         policy: str | type[BasePolicy] | GymEnv = "KNNPolicy",
@@ -86,13 +151,6 @@ class KNNTD(KNNAlgorithm):
         self.temperature = temperature
         if _init_setup_model:
             self._setup_model()
-
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": KNNPolicy}
-    _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
-    _action_space_advice: ClassVar[str] = (
-        "For a Box of actions use ExA; MultiDiscrete and MultiBinary can be numbered into one Discrete space by "
-        "a gymnasium.ActionWrapper"
-    )
 
     def _make_rule(self) -> ActionRule:
         check_word("target", self.target, ["sarsa", "q_learning", "expected_sarsa"])

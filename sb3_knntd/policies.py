@@ -19,7 +19,7 @@ from sb3_knntd.kernels.perceive import FOUND
 from sb3_knntd.kernels.step import best_actions
 from sb3_knntd.memory import DenseTable, HashedTable, QTable
 from sb3_knntd.perception import Lattice, Perceiver, Perception, Points, make_bounds, make_points, make_weights
-from sb3_knntd.perception.search import make_search
+from sb3_knntd.perception.search import SEARCHES, make_search
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.rules import mean_rows
 
@@ -128,6 +128,11 @@ class KNNPolicy(BasePolicy):
     def device(self) -> th.device:
         """Where the table is."""
         return self.table.values.device
+
+    @property
+    def search_name(self) -> str:
+        """Name of the neighbour search in use."""
+        return next(name for name, kind in SEARCHES.items() if type(self.perceiver.search) is kind)
 
     @property
     def points(self) -> th.Tensor:

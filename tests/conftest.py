@@ -48,7 +48,16 @@ def make_model(make_venv: Callable[..., VecEnv]) -> Callable[..., KNNTD]:
     """Makes ``make_model(env, **arguments)``: a model with 48 points, by default of one drifting point, seed 0."""
 
     def make(env: Any = None, **kwargs: Any) -> KNNTD:
-        arguments = {"points": (8, 6), "bounds": (DriftEnv.LOW, DriftEnv.HIGH), "n_neighbors": 4, "seed": 0}
+        # Named, that no test hangs on a default that may be found better one day.
+        arguments = {
+            "points": (8, 6),
+            "bounds": (DriftEnv.LOW, DriftEnv.HIGH),
+            "n_neighbors": 4,
+            "learning_rate": 0.3,
+            "exploration_initial_eps": 0.1,
+            "exploration_final_eps": 0.0,
+            "seed": 0,
+        }
         return KNNTD(make_venv() if env is None else env, **{**arguments, **kwargs})
 
     return make

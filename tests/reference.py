@@ -63,7 +63,7 @@ def weigh(squared: Array, weights: Weights, bandwidth: float) -> Array:
     if callable(weights):
         return np.asarray(weights(squared), dtype=np.float64)
     if weights == "inverse_quadratic":
-        return 1.0 / (1.0 + squared / bandwidth**2)
+        return np.asarray(1.0 / (1.0 + squared / bandwidth**2))
     if weights == "gaussian":
         # A common factor leaves the probabilities as they are, and this one keeps them from being 0 / 0
         # where every exponential is too small for a float.
@@ -166,7 +166,7 @@ def shared_step(traces: Array, scaled_errors: Array) -> Array:
     largest = traces.max(axis=0)
     share = np.divide(largest, total, out=np.zeros_like(total), where=total > 0)
     summed = (scaled_errors[:, None, None] * traces).sum(axis=0)
-    return share * summed
+    return np.asarray(share * summed)
 
 
 class ReferenceKNNTD:
@@ -201,7 +201,7 @@ class ReferenceKNNTD:
         indices, p = self.perceive(state)
         # Not a matrix product: every action's sum must be taken in the same order, or equal values would
         # come out unequal and the tie be broken by rounding.
-        return (p[:, None] * self.q_table[indices]).sum(axis=0)
+        return np.asarray((p[:, None] * self.q_table[indices]).sum(axis=0))
 
     def greedy_action(self, state: Any) -> int:
         """Eq. 9; of several best actions the first."""

@@ -340,7 +340,7 @@ class FaultyReset(gym.Wrapper[Any, Any, Any, Any]):
 @pytest.mark.parametrize("episode", [0, 1, 2])
 def test_fault_in_a_first_observation(make_model: MakeModel, episode: int) -> None:
     model = make_model(FaultyReset(DriftEnv(), episode))
-    with pytest.raises(ValueError, match=r"environment 0 .*observation.* not finite, component 0"):
+    with pytest.raises(ValueError, match=r"(?=.*environment 0)(?=.*observation)(?=.*component 0)"):
         model.learn(40)
     assert th.isfinite(model.policy.q_table).all()
 
@@ -362,7 +362,7 @@ def test_learning_after_a_fault_does_not_bridge_it(make_model: MakeModel) -> Non
 def test_fault_while_the_range_is_measured(component: int | None) -> None:
     env = Faulty(gym.make("CartPole-v1"), 40, component, NAN)
     model = KNNTD(env, points=3, n_neighbors=2, seed=0)
-    with pytest.raises(ValueError, match=r"environment 0 .* step 40"):
+    with pytest.raises(ValueError, match=r"(?=.*environment 0)(?=.*step 40)"):
         model.learn(1100)
     model.learn(1100)
     assert th.isfinite(model.policy.points).all()
@@ -373,6 +373,6 @@ def test_fault_behind_normalisation(make_model: MakeModel) -> None:
     venv = VecNormalize(faulty_venv(2, 1, fault_at=20, component=1, value=NAN))
     model = make_model(venv, bounds=([-2.0, -2.0], [2.0, 2.0]))
     # VecNormalize spreads the NaN over all environments, so that only the component can be told.
-    with pytest.raises(ValueError, match=r"not finite, component 1.* step 40"):
+    with pytest.raises(ValueError, match=r"(?=.*component 1)(?=.*step 40)"):
         model.learn(100)
     assert th.isfinite(model.policy.q_table).all()

@@ -652,12 +652,11 @@ def unequal_drifts(n_envs: int) -> list[EnvMaker]:
 
 @pytest.mark.parametrize(("variant", "points"), LEARNING_ON_POINTS)
 @pytest.mark.parametrize("n_envs", [3, 8])
-@pytest.mark.parametrize("n_neighbors", [1, 4])
 @pytest.mark.parametrize("step_size", ["paper", "normalized"])
 @pytest.mark.parametrize("traces", ["replacing", "accumulating"])
 @pytest.mark.parametrize("trace_decay", [0.0, 0.95])
 def test_envs_share_one_table(
-    variant: str, points: str, n_envs: int, n_neighbors: int, step_size: str, traces: str, trace_decay: float
+    variant: str, points: str, n_envs: int, step_size: str, traces: str, trace_decay: float
 ) -> None:
     venv = check(
         unequal_drifts(n_envs),
@@ -665,7 +664,6 @@ def test_envs_share_one_table(
         variant,
         **drift(
             points=POINTS[points],
-            n_neighbors=n_neighbors,
             step_size=step_size,
             traces=traces,
             trace_decay=trace_decay,

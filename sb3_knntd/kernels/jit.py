@@ -11,7 +11,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 try:
     import numba
 
-    AVAILABLE = not os.environ.get("NUMBA_DISABLE_JIT", "0") == "1"
+    AVAILABLE = os.environ.get("NUMBA_DISABLE_JIT", "0") != "1"
     #: why numba cannot be used, empty if it can
     REASON = "" if AVAILABLE else "NUMBA_DISABLE_JIT is set"
 except Exception as error:  # a numba that does not fit the installed NumPy raises more than ImportError

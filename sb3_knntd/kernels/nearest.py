@@ -189,3 +189,36 @@ def nearest_on_lattice_batch(scaled, axes, offsets, k, indices, distances):
     """:func:`nearest_on_lattice` for each row of ``scaled``, shape (batch, obs_dim)."""
     for row in range(len(scaled)):
         nearest_on_lattice(scaled[row], axes, offsets, k, indices[row], distances[row])
+
+
+@jit
+def order_candidates(scaled, places, candidates, indices, distances):
+    """
+    The first k of some candidates by (squared distance, index), for each of a batch.
+
+    :param scaled: observations, scaled units, shape (batch, obs_dim)
+    :param places: the points' coordinates, scaled units, shape (n_points, obs_dim)
+    :param candidates: points, at least k, shape (batch, n), int64
+    :param indices: to be filled, shape (batch, k), int64
+    :param distances: to be filled with squared distances, shape (batch, k)
+    """
+    n_dims, k = places.shape[1], indices.shape[1]
+    for row in range(len(scaled)):
+        for count in range(candidates.shape[1]):
+            point = candidates[row, count]
+            total = 0.0
+            for j in range(n_dims):
+                difference = scaled[row, j] - places[point, j]
+                total += difference * difference
+            place = min(count, k)
+            while place > 0 and (
+                distances[row, place - 1] > total
+                or (distances[row, place - 1] == total and indices[row, place - 1] > point)
+            ):
+                if place < k:
+                    distances[row, place] = distances[row, place - 1]
+                    indices[row, place] = indices[row, place - 1]
+                place -= 1
+            if place < k:
+                distances[row, place] = total
+                indices[row, place] = point

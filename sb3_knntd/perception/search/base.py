@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_knntd.kernels.nearest import order_candidates
 from sb3_knntd.kernels.perceive import FOUND
 from sb3_knntd.perception.bounds import Bounds
 from sb3_knntd.perception.points import Points
@@ -60,3 +61,16 @@ class Search(ABC):
             default it is told that neighbours are found before it is called
         """
         return FOUND, np.empty(0), np.empty(0, np.int64), np.empty((0, 0))
+
+
+def nearest_of_candidates(queries: np.ndarray, places: np.ndarray, candidates: np.ndarray, k: int) -> Neighbors:
+    """
+    :param queries: shape (batch, obs_dim), scaled units
+    :param places: the points, shape (n_points, obs_dim), scaled units
+    :param candidates: at least k of them for each query, shape (batch, n), int64
+    :param k: number of neighbours
+    :return: the first k by (squared distance, index)
+    """
+    indices, distances = np.empty((len(queries), k), np.int64), np.empty((len(queries), k))
+    order_candidates(queries, places, candidates, indices, distances)
+    return Neighbors(th.from_numpy(indices), th.from_numpy(distances))
