@@ -6,8 +6,8 @@ import io
 import json
 import os
 import pathlib
+import secrets
 import sys
-import tempfile
 import time
 import zipfile
 from abc import abstractmethod
@@ -25,7 +25,7 @@ from stable_baselines3.common.utils import FloatSchedule, safe_mean
 
 from sb3_knntd.checks import check_number, check_schedule, check_word
 from sb3_knntd.compiled_learner import CompiledLearner
-from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, Transition, check_transition
+from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, Transition, check_finite, check_transition
 from sb3_knntd.memory import DenseTable
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
@@ -37,7 +37,7 @@ SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 MEASURING_STEPS = 1000
 MEASURING_STEPS_PER_ENV = 100
 
-NOTHING = np.empty(0)
+NO_ENDINGS: tuple[list[int], np.ndarray] = [], np.empty(0)
 
 
 class KNNAlgorithm(BaseAlgorithm):
@@ -228,9 +228,9 @@ class KNNAlgorithm(BaseAlgorithm):
         return TorchLearner(perceiver, table, rule, self.n_envs, form)
 
     def _check_parameters(self) -> None:
-        check_schedule("learning_rate", self.learning_rate, 0.0)
-        check_number("gamma", self.gamma, 0.0, 1.0)
-        check_schedule("trace_decay", self.trace_decay, 0.0, 1.0)
+        self.learning_rate = check_schedule("learning_rate", self.learning_rate, 0.0)
+        self.gamma = check_number("gamma", self.gamma, 0.0, 1.0)
+        self.trace_decay = check_schedule("trace_decay", self.trace_decay, 0.0, 1.0)
         check_word("step_size", self.step_size, ["paper", "normalized"])
         check_word("traces", self.traces, ["replacing", "accumulating"])
         check_word("tie_break", self.tie_break, ["random", "first"])
@@ -246,6 +246,32 @@ class KNNAlgorithm(BaseAlgorithm):
         """
         super().set_random_seed(seed)
         self._stream = RandomStream(seed, (self.n_envs, 2, self._rule.n_uniforms))
+        self._prediction_stream = RandomStream(seed, (self._rule.n_uniforms,), purpose=1)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The action the table recommends, ties to the lowest; or, if not deterministic, one from the exploration
+        policy at its present rate.
+
+        :param observation: one observation, or a batch, observation units
+        :param state: handed back, a table has none
+        :param episode_start: has no effect
+        :param deterministic: whether to leave out exploration
+        :return: action, or a batch of them, and ``state``
+        """
+        greedy, state = self.policy.predict(observation, state, episode_start, deterministic)
+        if deterministic:
+            return greedy, state
+        rows, probabilities = self.policy.perceived_rows(np.asarray(observation))
+        uniforms = th.from_numpy(np.stack([self._prediction_stream.next() for _ in range(len(rows))]))
+        choice = self._rule.choose(rows, probabilities, uniforms.to(rows.device), self.exploration_rate)
+        return self._env_actions(choice.actions.cpu().numpy()).reshape(greedy.shape), state
 
     # --------------------------------------------------------------- learning
 
@@ -298,7 +324,12 @@ class KNNAlgorithm(BaseAlgorithm):
         if reset_num_timesteps or self._last_obs is None:
             # The environments are about to be reset, and with them the episodes and the actions chosen in them.
             self._last_actions = None
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if total_timesteps > self.num_timesteps:
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+        return total_timesteps, callback
 
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """
@@ -311,56 +342,67 @@ class KNNAlgorithm(BaseAlgorithm):
         callback.on_rollout_start()
         actions = self._random_actions() if self._measuring else self._current_actions()
         new_obs, rewards, dones, infos = env.step(self._env_actions(actions))
-        transition = self._transition(new_obs, rewards, dones, infos)  # type: ignore[arg-type]
         n_before = self.num_timesteps
         self.num_timesteps += env.num_envs
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         try:
+            ended = dones.tolist()
+            endings = self._endings(ended, infos) if True in ended else NO_ENDINGS
+            transition = Transition(new_obs, rewards, dones, *endings)  # type: ignore[arg-type]
             if self._measuring:
                 self._measure(transition)
             else:
                 self._last_actions = self.learner.learn(transition, self._stream.next(), self._rates())
         except (ValueError, FloatingPointError) as error:
             step, self.num_timesteps = self.num_timesteps, n_before
+            # What was going on in the environments is lost with this step: to go on is to begin anew.
+            self._last_obs = self._last_actions = None
             raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
         self._last_obs = new_obs  # type: ignore[assignment]
+        self._update_info_buffer(infos, dones)
+        n_logs = 0
+        if True in ended:
+            before = self._episode_num
+            self._episode_num += ended.count(True)
+            n_logs = self._episode_num // log_interval - before // log_interval if log_interval else 0
 
         callback.update_locals(locals())
         if not callback.on_step():
             return False
-        self._update_info_buffer(infos, dones)
-        for _ in range(np.count_nonzero(dones)):
-            self._episode_num += 1
-            if log_interval is not None and self._episode_num % log_interval == 0:
-                self.dump_logs()
+        if n_logs:
+            self.dump_logs()
         callback.on_rollout_end()
         return True
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last steps of several environments can go beyond the total.
+        self._current_progress_remaining = max(0.0, 1.0 - num_timesteps / total_timesteps)
 
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
         self.exploration_rate = self.exploration_schedule(progress)
-        return Rates(self.lr_schedule(progress), self.trace_schedule(progress), self.exploration_rate)
+        return self.lr_schedule(progress), self.trace_schedule(progress), self.exploration_rate
 
     def _current_actions(self) -> np.ndarray:
         """The actions chosen in the last step, or at the start of the episodes."""
         if self._last_actions is None:
             assert isinstance(self._last_obs, np.ndarray)
-            self._last_actions = self.learner.begin(self._last_obs, self._stream.next()[:, 0], self._rates())
+            uniforms = self._stream.next()[:, 0]
+            self._last_actions = self.learner.begin(self._last_obs, uniforms, self._rates()[2])
         return self._last_actions
 
-    def _transition(
-        self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
-    ) -> Transition:
-        """Put together what is learned from."""
-        truncated = [
-            index
-            for index, done in enumerate(dones.tolist())
-            if done and infos[index].get("TimeLimit.truncated", False) and "terminal_observation" in infos[index]
-        ]
-        if not truncated:
-            return Transition(new_obs, rewards, dones, truncated, NOTHING)
-        last_observations = np.array([infos[index]["terminal_observation"] for index in truncated])
-        return Transition(new_obs, rewards, dones, truncated, last_observations)
+    @staticmethod
+    def _endings(ended: list[bool], infos: list[dict[str, Any]]) -> tuple[list[int], np.ndarray]:
+        """Which episodes ended by a time limit, and their last observations; all that ended must be finite."""
+        truncated, last_observations = [], []
+        for index, info in enumerate(infos):
+            if ended[index] and "terminal_observation" in info:
+                last = np.asarray(info["terminal_observation"])
+                check_finite("a last observation", last[None], [index])
+                if info.get("TimeLimit.truncated", False):
+                    truncated.append(index)
+                    last_observations.append(last)
+        return truncated, np.array(last_observations)
 
     # -------------------------------------------- the range of open dimensions
 
@@ -415,7 +457,7 @@ class KNNAlgorithm(BaseAlgorithm):
     # ------------------------------------------------------ saving and loading
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rule", "_stream"]
+        return [*super()._excluded_save_params(), "_rule", "_stream", "_prediction_stream"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "learner"], []
@@ -434,7 +476,7 @@ class KNNAlgorithm(BaseAlgorithm):
         :param exclude: attributes to leave out besides SB3's
         :param include: attributes to save although SB3 leaves them out
         """
-        self._stream_state = self._stream.state()
+        self._stream_states = [self._stream.state(), self._prediction_stream.state()]
         if not isinstance(path, (str, pathlib.Path)):
             super().save(path, exclude, include)
             return
@@ -442,15 +484,15 @@ class KNNAlgorithm(BaseAlgorithm):
         if not target.suffix:
             target = target.with_name(f"{target.name}.zip")
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, beside = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        beside = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
         try:
-            with os.fdopen(handle, "wb") as file:
+            with open(beside, "xb") as file:
                 super().save(file, exclude, include)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(beside, target)
         except BaseException:
-            pathlib.Path(beside).unlink(missing_ok=True)
+            beside.unlink(missing_ok=True)
             raise
 
     @classmethod
@@ -478,16 +520,22 @@ class KNNAlgorithm(BaseAlgorithm):
         :return: the model
         :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has
         """
-        saved_as = _algorithm_of(path)
-        if saved_as != cls.__name__:
-            raise ValueError(f"{path} holds a model of {saved_as}, not of {cls.__name__}: load it with its own class")
+        saved = _read_data(path)
+        if saved.get("algorithm") != cls.__name__:
+            raise ValueError(
+                f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls.__name__}: "
+                "load it with its own class"
+            )
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        model._stream.set_state(model._stream_state)
+        if model.n_envs != saved["n_envs"]:
+            model._last_obs = model._last_actions = None
+        for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
+            stream.set_state(state)
         return model
 
 
-def _algorithm_of(path: str | pathlib.Path | io.BufferedIOBase) -> str:
-    """Name of the algorithm that saved a file, read without unpickling anything."""
+def _read_data(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
+    """What a saved file says of its model, read without unpickling anything; the file is checked to be whole."""
     file: Any = path
     if isinstance(path, (str, pathlib.Path)):
         candidates = [pathlib.Path(path), pathlib.Path(f"{path}.zip")]
@@ -500,9 +548,13 @@ def _algorithm_of(path: str | pathlib.Path | io.BufferedIOBase) -> str:
             if damaged is not None:
                 raise ValueError(f"{path} is damaged: {damaged} in it is not what was written")
             data = json.loads(archive.read("data"))
+            if not isinstance(data, dict):
+                raise ValueError(f"{path} is no saved model: what it says of its parameters is {data!r}")
+            if data.get("algorithm"):
+                archive.getinfo("policy.pth"), archive.getinfo("learner.pth")
     except (zipfile.BadZipFile, KeyError, json.JSONDecodeError, EOFError) as error:
         raise ValueError(f"{path} is no saved model, or was cut off: {error}") from error
     finally:
         if not isinstance(path, (str, pathlib.Path)):
             path.seek(0)
-    return str(data.get("algorithm", "another algorithm"))
+    return data

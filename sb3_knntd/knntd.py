@@ -158,13 +158,13 @@ class KNNTD(KNNAlgorithm):
 
     def _make_exploration_schedule(self) -> Schedule:
         check_word("exploration", self.exploration, EXPLORATIONS)
+        initial = check_number("exploration_initial_eps", self.exploration_initial_eps, 0.0, 1.0)
+        final = check_number("exploration_final_eps", self.exploration_final_eps, 0.0, 1.0)
+        fraction = check_number("exploration_fraction", self.exploration_fraction, 0.0, 1.0, above=True)
+        self.temperature = check_schedule("temperature", self.temperature, 0.0, above=True)
         if self.exploration == "softmax":
-            check_schedule("temperature", self.temperature, 0.0, above=True)
             return FloatSchedule(self.temperature)
-        check_number("exploration_initial_eps", self.exploration_initial_eps, 0.0, 1.0)
-        check_number("exploration_final_eps", self.exploration_final_eps, 0.0, 1.0)
-        check_number("exploration_fraction", self.exploration_fraction, 0.0, 1.0, above=True)
-        return LinearSchedule(self.exploration_initial_eps, self.exploration_final_eps, self.exploration_fraction)
+        return LinearSchedule(initial, final, fraction)
 
     def _env_actions(self, actions: np.ndarray) -> np.ndarray:
         assert isinstance(self.action_space, spaces.Discrete)

@@ -32,18 +32,8 @@ class Transition(NamedTuple):
     last_observations: np.ndarray
 
 
-class Rates(NamedTuple):
-    """
-    The scheduled parameters at one step.
-
-    :param learning_rate: α
-    :param trace_decay: λ
-    :param exploration: ε or the temperature
-    """
-
-    learning_rate: float
-    trace_decay: float
-    exploration: float
+#: The scheduled parameters at one step: α, λ, and ε or the temperature.
+Rates = tuple[float, float, float]
 
 
 class Form(NamedTuple):
@@ -71,13 +61,13 @@ class Learner(ABC):
     n_envs: int
 
     @abstractmethod
-    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
+    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
         """
         Start an episode in every environment.
 
         :param observations: shape (n_envs, *obs_shape)
         :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
-        :param rates: the scheduled parameters
+        :param rate: ε or the temperature
         :return: index of the action to take in each environment, shape (n_envs,), int64
         :raises ValueError: if an observation is not finite
         """
@@ -177,23 +167,23 @@ class TorchLearner(Learner):
         self._sums = values.new_zeros(2)
         self._n_sums = 0
 
-    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
+    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
         check_finite("an observation", observations, range(self.n_envs))
         self.traces.clear()
-        perception, choice = self._choose(observations, uniforms, rates)
+        perception, choice = self._choose(observations, uniforms, rate)
         return self._settle_in(perception, choice)
 
     def learn(self, transition: Transition, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
         check_transition(transition)
-        perception, choice = self._choose(transition.observations, uniforms[:, 0], rates)
+        perception, choice = self._choose(transition.observations, uniforms[:, 0], rates[2])
         worth = choice.values * self._tensor(~transition.ended)
         if transition.truncated:
-            _, last = self._choose(transition.last_observations, uniforms[transition.truncated, 1], rates)
+            _, last = self._choose(transition.last_observations, uniforms[transition.truncated, 1], rates[2])
             worth[transition.truncated] = last.values
 
         value = self._value()
         errors = self._tensor(transition.rewards).to(worth.dtype) + self.form.gamma * worth - value
-        corrections = rates.learning_rate * errors
+        corrections = rates[0] * errors
         if self.form.normalized:
             corrections = corrections / self.probabilities.square().sum(dim=1)
         # On an accelerator looking would mean waiting for it.
@@ -202,7 +192,7 @@ class TorchLearner(Learner):
 
         self.traces.mark(self.indices, self.entries, self.probabilities)
         self.traces.credit(corrections)
-        self.traces.decay(self.form.gamma * rates.trace_decay, self._tensor(transition.ended))
+        self.traces.decay(self.form.gamma * rates[1], self._tensor(transition.ended))
         self.table.visited[self.indices] = True
         self._sums += th.stack((errors.abs().sum(), value.sum()))
         self._n_sums += self.n_envs
@@ -232,11 +222,11 @@ class TorchLearner(Learner):
             getattr(self, name).copy_(state_dict[name])
         self.traces.set_state(state_dict["traces"])
 
-    def _choose(self, observations: np.ndarray, uniforms: np.ndarray, rates: Rates) -> tuple[Perception, Choice]:
+    def _choose(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> tuple[Perception, Choice]:
         perception = self.perceiver(self._tensor(observations))
         probabilities = perception.probabilities.to(self.table.values.dtype)
         rows = self.table.rows(perception.indices)
-        choice = self.rule.choose(rows, probabilities, self._tensor(uniforms), rates.exploration)
+        choice = self.rule.choose(rows, probabilities, self._tensor(uniforms), rate)
         return Perception(perception.indices, probabilities), choice
 
     def _value(self) -> th.Tensor:

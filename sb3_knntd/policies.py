@@ -164,7 +164,15 @@ class KNNPolicy(BasePolicy):
         :param observation: one observation, or a batch, observation units
         :return: Q(s, ·) = Σ p(i) Q(i, ·) (eq. 8), shape (batch, n_actions)
         """
-        return mean_rows(*self._rows(self._to_tensor(observation)))
+        return mean_rows(*self.perceived_rows(observation))
+
+    def perceived_rows(self, observation: np.ndarray | th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param observation: one observation, or a batch, observation units
+        :return: the table's rows at its nearest points, shape (batch, k, n_actions), and how much each counts,
+            shape (batch, k)
+        """
+        return self._rows(self._to_tensor(observation))
 
     def predict(
         self,
@@ -195,7 +203,8 @@ class KNNPolicy(BasePolicy):
         if not np.isfinite(observations).all():
             raise ValueError(f"observation must be finite; got {observations.tolist()}")
         n, k = len(observations), self.n_neighbors
-        eyes = self.perceiver.kernel_arguments()
+        eyes = self.perceiver.eyes
+        assert eyes is not None
         if eyes[3] == FOUND:
             neighbors = self.perceiver.find(th.from_numpy(observations))
             indices, probabilities = neighbors.indices.numpy(), neighbors.squared_distances.numpy()
@@ -259,7 +268,8 @@ class KNNPolicy(BasePolicy):
 def _count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
     exact = not isinstance(observation_space, spaces.Box)
     if isinstance(n_neighbors, str):
-        check_word("n_neighbors", n_neighbors, ["auto"])
+        if n_neighbors != "auto":
+            raise ValueError(f"n_neighbors must be an integer >= 1, or 'auto'; got {n_neighbors!r}")
         return 1 if exact else min(2 * obs_dim + 1, n_points)
     k = check_integer("n_neighbors", n_neighbors, 1)
     if exact and k != 1:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-#: Rows made at a time; drawing one from NumPy costs more than reading it from a block.
+#: Rows made at a time; drawing one from NumPy costs more than taking it from a block.
 ROWS_PER_BLOCK = 1024
 
 
@@ -17,27 +18,28 @@ class RandomStream:
 
     :param seed: seed, or ``None`` for one from the operating system
     :param shape: shape of a row
+    :param purpose: streams of one seed for different purposes have nothing in common
     """
 
-    def __init__(self, seed: int | None, shape: tuple[int, ...]) -> None:
+    def __init__(self, seed: int | None, shape: tuple[int, ...], purpose: int = 0) -> None:
         self.shape = shape
-        self._key = np.random.SeedSequence(seed).generate_state(2, np.uint64)
+        self._key = np.random.SeedSequence(seed, spawn_key=(purpose,)).generate_state(2, np.uint64)
         self._position = 0
-        self._block_number = -1
-        self._block = np.empty((0, *shape))
+        self._rows: Iterator[np.ndarray] = iter(())
 
     def next(self) -> np.ndarray:
         """
         :return: the next row, numbers in [0, 1), a view that must not be written to
         """
-        number, row = divmod(self._position, ROWS_PER_BLOCK)
-        if number != self._block_number:
+        row = next(self._rows, None)
+        if row is None:
+            number, done = divmod(self._position, ROWS_PER_BLOCK)
             bits = np.random.Philox(key=self._key, counter=[0, 0, number, 0])
-            self._block = np.random.Generator(bits).random((ROWS_PER_BLOCK, *self.shape))
-            self._block_number = number
+            block = np.random.Generator(bits).random((ROWS_PER_BLOCK, *self.shape))
+            self._rows = iter(block[done:])
+            row = next(self._rows)
         self._position += 1
-        drawn: np.ndarray = self._block[row]
-        return drawn
+        return row
 
     def state(self) -> dict[str, Any]:
         """
@@ -51,4 +53,4 @@ class RandomStream:
         """
         self._key = np.array(state["key"], dtype=np.uint64)
         self._position = state["position"]
-        self._block_number = -1
+        self._rows = iter(())

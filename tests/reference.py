@@ -39,8 +39,7 @@ class Perceiver(Protocol):
 def scale(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
     """Eq. 4: the range between the bounds becomes [-1, 1]; what lies outside is not clipped."""
     at, start, end = (np.asarray(v, dtype=np.float64) for v in (x, low, high))
-    scaled: Array = 2.0 * (at - start) / (end - start) - 1.0
-    return scaled
+    return np.asarray(2.0 * (at - start) / (end - start) - 1.0)
 
 
 def lattice(sizes: Sequence[int]) -> Array:
@@ -67,7 +66,7 @@ def weigh(squared: Array, weights: Weights, bandwidth: float) -> Array:
     if weights == "gaussian":
         # A common factor leaves the probabilities as they are, and this one keeps them from being 0 / 0
         # where every exponential is too small for a float.
-        return np.exp(-(squared - squared.min()) / (2.0 * bandwidth**2))
+        return np.asarray(np.exp(-(squared - squared.min()) / (2.0 * bandwidth**2)))
     raise ValueError(weights)
 
 

@@ -40,6 +40,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "torch lattice": {"search": "lattice", "policy_kwargs": {"compiled": False}},
     "compiled brute": {"search": "brute"},
     "compiled lattice": {"search": "lattice"},
+    "torch kd_tree": {"search": "kd_tree", "policy_kwargs": {"compiled": False}},
+    "compiled kd_tree": {"search": "kd_tree"},
 }
 # A variant that serves only some kinds of points, spaces or weights names them here: "lattice", "scattered",
 # "discrete", "inverse_quadratic", "gaussian", "callable". The others serve all.
@@ -47,6 +49,8 @@ SERVES: dict[str, set[str]] = {
     "torch lattice": {"lattice", "inverse_quadratic", "gaussian", "callable"},
     "compiled brute": {"lattice", "scattered", "discrete", "inverse_quadratic", "gaussian"},
     "compiled lattice": {"lattice", "inverse_quadratic", "gaussian"},
+    "torch kd_tree": {"scattered", "inverse_quadratic", "gaussian", "callable"},
+    "compiled kd_tree": {"lattice", "scattered", "inverse_quadratic", "gaussian"},
 }
 
 # The variants whose learning differs. A search only finds the neighbours, so tests of learning need not be run once

@@ -157,7 +157,7 @@ def test_set_env_refuses_what_does_not_fit(make_model: MakeModel, make_venv: Mak
 
 
 def test_env_is_made_from_its_id(make_model: MakeModel) -> None:
-    model = KNNTD("CliffWalking-v1", seed=0)
+    model = KNNTD("FrozenLake-v1", seed=0)
     venv = model.get_env()
     assert isinstance(venv, VecEnv)
     assert venv.num_envs == 1

@@ -114,11 +114,11 @@ def choose(values, uniforms, rate, target, exploration, random_ties, shares):
 
 
 @jit
-def begin(inbox, uniforms, rate, eyes, rule, states, memory):
+def begin(observations, uniforms, rate, eyes, rule, states, memory):
     """
     Perceive and choose where every environment begins an episode.
 
-    :param inbox: shape (n_envs, 2 obs_dim + 3), of which the observation is read
+    :param observations: observation units, shape (n_envs, obs_dim)
     :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
     :param rate: ε or the temperature
     :param eyes: see :func:`~sb3_knntd.kernels.perceive.perceive`
@@ -130,25 +130,23 @@ def begin(inbox, uniforms, rate, eyes, rule, states, memory):
     target, exploration, random_ties = rule
     indices, probabilities, actions = states
     values, _, _, row_slots, initial, _, live, live_slots, _, pace = memory
-    n_dims = len(low)
     means, shares = np.empty(live.shape[1]), np.empty(live.shape[1])
-    for env in range(len(inbox)):
+    for env in range(len(observations)):
         here, there = indices[NOW, env], probabilities[NOW, env]
-        perceive(
-            inbox[env, :n_dims], low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there
-        )
+        perceive(observations[env], low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there)
         add_rows(here, there, values, row_slots, initial, live, live_slots, pace, means)
         actions[NOW, env], _ = choose(means, uniforms[env], rate, target, exploration, random_ties, shares)
 
 
 @jit
-def learn(inbox, uniforms, rates, gamma, form, eyes, rule, states, memory, sums):
+def learn(answers, endings, uniforms, rates, gamma, form, eyes, rule, states, memory, sums):
     """
     Perceive, choose, compute the TD errors and credit them (Algorithm 3), in all environments at once: every
     value is read before any is changed.
 
-    :param inbox: what the environments answered, shape (n_envs, 2 obs_dim + 3): observation, reward, whether the
-        episode ended, whether by truncation, and if so the true last observation
+    :param answers: (observations, rewards, ended) of the environments, shapes (n_envs, obs_dim) and (n_envs,) twice
+    :param endings: (truncated, last observations): whether an episode ended by truncation, shape (n_envs,), and if so
+        what was seen last, shape (n_envs, obs_dim)
     :param uniforms: random numbers in [0, 1), shape (n_envs, 2, n_uniforms)
     :param rates: (α, λ, ε or temperature)
     :param gamma: γ
@@ -162,6 +160,8 @@ def learn(inbox, uniforms, rates, gamma, form, eyes, rule, states, memory, sums)
     :param sums: sums of the errors' sizes and of the values, to be added to, shape (2,)
     :return: ``FINE``; or ``NOT_FINITE`` or ``DIVERGED``, and then no value has been changed
     """
+    observations, rewards, ended = answers
+    truncated, last_observations = endings
     learning_rate, trace_decay, rate = rates
     normalized, accumulating, reset_others = form
     low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
@@ -176,25 +176,21 @@ def learn(inbox, uniforms, rates, gamma, form, eyes, rule, states, memory, sums)
     size, value_sum = 0.0, 0.0
 
     for env in range(n_envs):
-        for j in range(n_dims + 1):
-            if not np.isfinite(inbox[env, j]):
+        if not np.isfinite(rewards[env]):
+            return NOT_FINITE
+        for j in range(n_dims):
+            if not np.isfinite(observations[env, j]):
                 return NOT_FINITE
-        reward, ended, truncated = inbox[env, n_dims], inbox[env, n_dims + 1] > 0.0, inbox[env, n_dims + 2] > 0.0
         here, there = indices[THEN, env], probabilities[THEN, env]
-        perceive(
-            inbox[env, :n_dims], low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there
-        )
+        perceive(observations[env], low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there)
         add_rows(here, there, values, row_slots, initial, live, live_slots, pace, means)
         actions[THEN, env], worth = choose(means, uniforms[env, 0], rate, target, exploration, random_ties, shares)
-        if truncated:
-            for j in range(n_dims + 3, 2 * n_dims + 3):
-                if not np.isfinite(inbox[env, j]):
-                    return NOT_FINITE
-            here, there, seen = indices[LAST, env], probabilities[LAST, env], inbox[env, n_dims + 3 :]
+        if truncated[env]:
+            here, there, seen = indices[LAST, env], probabilities[LAST, env], last_observations[env]
             perceive(seen, low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there)
             add_rows(here, there, values, row_slots, initial, live, live_slots, pace, means)
             _, worth = choose(means, uniforms[env, 1], rate, target, exploration, random_ties, shares)
-        elif ended:
+        elif ended[env]:
             worth = 0.0
         value, squares = 0.0, 0.0
         for i in range(k):
@@ -205,7 +201,7 @@ def learn(inbox, uniforms, rates, gamma, form, eyes, rule, states, memory, sums)
             probability = probabilities[NOW, env, i]
             value += probability * total(live, place, actions[NOW, env], pace)
             squares += probability * probability
-        error = reward + gamma * worth - value
+        error = rewards[env] + gamma * worth - value
         corrections[env] = learning_rate * error / squares if normalized else learning_rate * error
         if not np.isfinite(corrections[env]):
             return DIVERGED
@@ -228,7 +224,7 @@ def learn(inbox, uniforms, rates, gamma, form, eyes, rule, states, memory, sums)
         pace[1 + env] += corrections[env] * pace[0]
     pace[0] *= gamma * trace_decay
     for env in range(n_envs):
-        if inbox[env, n_dims + 1] > 0.0:
+        if ended[env]:
             end_episode(env, values, row_slots, live_points, live, live_slots, counts, pace)
     if pace[0] < LEAST_CLOCK:
         settle(values, row_slots, live_points, live, live_slots, counts, pace)

@@ -21,7 +21,7 @@ class LiveStore:
     :param n_envs: number of environments
     """
 
-    SMALLEST = 256
+    SMALLEST = 1024
 
     def __init__(self, table: QTable, n_envs: int) -> None:
         self.table = table

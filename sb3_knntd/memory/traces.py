@@ -85,7 +85,7 @@ class Traces:
             "traces": traces,
             "share": th.where(together > 0, traces.amax(dim=2) / together, 1.0),
             "pace": th.eye(1, 1 + len(self.eligibility), dtype=th.float64)[0],
-            "capacity": max(256, 2 * len(points)),
+            "capacity": max(1024, 2 * len(points)),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:

@@ -133,5 +133,6 @@ def _bounds_of(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.nda
         first, counts = observation_space.start, observation_space.nvec
     else:
         raise TypeError(f"no bounds are defined for {observation_space}")
-    # A dimension with a single state has no width; any width will do for its single point.
-    return first.astype(np.float64), (first + np.maximum(counts - 1, 1)).astype(np.float64)
+    # A lattice has its only point in the middle; a dimension with a single state has it at that state.
+    alone = (counts == 1).astype(np.float64)
+    return first - alone, first + np.maximum(counts - 1, 1)

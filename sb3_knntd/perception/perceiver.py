@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch as th
 from torch import nn
 
+from sb3_knntd.kernels.perceive import FOUND
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.points import Points
 from sb3_knntd.perception.search import Neighbors, Search
@@ -35,6 +36,12 @@ class Perceiver(nn.Module):
     :param weights: weighs them by distance
     """
 
+    #: ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`; ``None`` on an accelerator or with weights that are a
+    #: function, where no kernel can be used
+    eyes: tuple[Any, ...] | None
+    #: whether neighbours have to be found before a kernel is called
+    search_is_outside: bool
+
     def __init__(self, bounds: Bounds, points: Points, search: Search, weights: Weights) -> None:
         super().__init__()
         self.bounds = bounds
@@ -46,20 +53,15 @@ class Perceiver(nn.Module):
     def fit(self) -> None:
         """Bring the search up to date with the bounds and their device."""
         self.search.fit(self.bounds)
-        self._kernel_arguments: tuple[Any, ...] | None = None
+        self.eyes = self._make_eyes()
+        self.search_is_outside = self.eyes is not None and self.eyes[3] == FOUND
 
-    def kernel_arguments(self) -> tuple[Any, ...]:
-        """
-        :return: ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`
-        :raises TypeError: if the weights are a function that no kernel knows
-        """
-        if self._kernel_arguments is None:
-            if not isinstance(self.weights, KernelWeights):
-                raise TypeError("weights that are a function cannot be compiled")
-            low, high = self.bounds.low.numpy(), self.bounds.high.numpy()
-            weights = (self.weights.KERNEL, self.weights.bandwidth)
-            self._kernel_arguments = (low, high - low, FARTHEST, *self.search.kernel_arguments(), *weights)
-        return self._kernel_arguments
+    def _make_eyes(self) -> tuple[Any, ...] | None:
+        if not isinstance(self.weights, KernelWeights) or not self.bounds.low.is_cpu:
+            return None
+        low, high = self.bounds.low.numpy(), self.bounds.high.numpy()
+        weights = (self.weights.KERNEL, self.weights.bandwidth)
+        return (low, high - low, FARTHEST, *self.search.kernel_arguments(), *weights)
 
     def find(self, observations: th.Tensor) -> Neighbors:
         """

@@ -101,7 +101,13 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
         per_dimension = min(AUTO_POINTS_PER_DIMENSION, max(2, round(AUTO_POINTS ** (1 / obs_dim))))
         return Lattice((per_dimension,) * obs_dim)
 
-    array = np.asarray(points)
+    try:
+        array = np.asarray(points)
+    except ValueError as error:
+        raise ValueError(
+            f"points: scattered points must be an array of shape (n_points, {obs_dim}); got rows of different "
+            f"lengths: {points!r}"
+        ) from error
     if array.ndim == 0:
         return Lattice((check_integer("points", points, 1),) * obs_dim)
     if array.ndim == 1:

@@ -73,7 +73,11 @@ class Custom:
         self.function = function
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
-        weights = th.as_tensor(self.function(squared_distances), dtype=th.float64, device=squared_distances.device)
+        answer = self.function(squared_distances)
+        try:
+            weights = th.as_tensor(answer, dtype=th.float64, device=squared_distances.device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"weights: the function must return an array of numbers; got {answer!r}") from error
         if weights.shape != squared_distances.shape:
             raise ValueError(
                 f"weights: the function must return an array of the shape it is given, "
@@ -106,9 +110,11 @@ def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
         check_word("weights", weights, _BUILT_IN)
         return _BUILT_IN[weights](bandwidth)
     custom = Custom(weights)
-    # From an observation on top of a point to one at the far corner of a four-dimensional box.
+    # From an observation on top of a point to one at the far corner of a four-dimensional box; more rows than
+    # neighbours, so that a function that mixes up the two axes is found out.
     reach = th.linspace(0.0, 1.0, n_neighbors, dtype=th.float64)
-    custom(th.stack([scale * reach + offset for scale, offset in ((0.0, 0.0), (0.1, 0.0), (1.0, 0.01), (4.0, 12.0))]))
+    scales, offsets = th.linspace(0.0, 4.0, n_neighbors + 2), th.linspace(0.0, 12.0, n_neighbors + 2)
+    custom(scales[:, None].double() * reach + offsets[:, None].double())
     return custom
 
 

@@ -29,7 +29,7 @@ class KDTreeSearch(Search):
     def query(self, scaled: th.Tensor) -> Neighbors:
         queries, k = scaled.cpu().numpy(), self.n_neighbors
         n_proposed = min(k + 1, self.points.n_points)
-        distances, proposed = self._tree.query(queries, k=n_proposed)
+        distances, proposed = map(np.asarray, self._tree.query(queries, k=n_proposed))
         # SciPy drops the axis of a single neighbour, and hands out int32 on some systems.
         distances = distances.reshape(len(queries), n_proposed)
         candidates = proposed.reshape(len(queries), n_proposed).astype(np.int64, copy=False)

@@ -1,0 +1,124 @@
+"""
+What is learned, as distributions over seeds: with no argument but the environment, with tuned settings, and with
+many environments in step.
+
+    python -m benchmarks.learning [--seeds 10] [--first-seed 100] [--only TABLE ...] [--json FILE]
+
+Each seed trains a model and then plays 100 greedy episodes in an environment of its own; the figure of a seed is their
+mean return, and a line shows the median over seeds with the 10 % and 90 % quantiles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from concurrent.futures import ProcessPoolExecutor
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from benchmarks.machine import describe
+from sb3_knntd import KNNTD
+
+EPISODES = 100
+
+
+class Case(NamedTuple):
+    """
+    One line of a table.
+
+    :param what: its name
+    :param env_id: environment
+    :param steps: environment steps of the training, over all environments together
+    :param target: what the median must reach; ``None`` if there is nothing to reach
+    :param n_envs: environments in step
+    :param tuned: whether the settings are those of ``zoo_configs/knntd.yml``
+    """
+
+    what: str
+    env_id: str
+    steps: int
+    target: float | None = None
+    n_envs: int = 1
+    tuned: bool = False
+
+
+TABLES = {
+    "untuned": [
+        Case("KNNTD(id)", "MountainCar-v0", 50_000, -130),
+        Case("KNNTD(id)", "CartPole-v1", 50_000, 400),
+        Case("KNNTD(id)", "Acrobot-v1", 50_000, -120),
+    ],
+    "tuned": [Case("tuned", "MountainCar-v0", 20_000, -110, tuned=True)],
+    "envs": [
+        Case("1 environment", "MountainCar-v0", 100_000),
+        Case("8 environments", "MountainCar-v0", 100_000, n_envs=8),
+        Case("64 environments", "MountainCar-v0", 100_000, n_envs=64),
+    ],
+}
+
+
+def tuned_settings(env_id: str) -> dict[str, Any]:
+    """
+    :param env_id: environment
+    :return: its arguments in ``zoo_configs/knntd.yml``
+    """
+    settings = yaml.safe_load(files("sb3_knntd.zoo_configs").joinpath("knntd.yml").read_text())[env_id]
+    return {name: value for name, value in settings.items() if name not in ("n_timesteps", "policy")}
+
+
+def play(case: Case, seed: int) -> float:
+    """
+    :param case: what to train
+    :param seed: seed of the model and its environments
+    :return: mean return of the greedy policy
+    """
+    th.set_num_threads(1)
+    settings = tuned_settings(case.env_id) if case.tuned else {}
+    model = KNNTD(make_vec_env(case.env_id, case.n_envs, seed=seed), seed=seed, **settings)
+    model.learn(case.steps)
+    evaluation = make_vec_env(case.env_id, 10, seed=10_000 + seed)
+    mean, _ = evaluate_policy(model, evaluation, n_eval_episodes=EPISODES, deterministic=True)
+    return float(mean)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=10, help="number of seeds")
+    parser.add_argument("--first-seed", type=int, default=100, help="the settings were tuned on others")
+    parser.add_argument("--only", nargs="+", choices=TABLES, metavar="TABLE", help=", ".join(TABLES))
+    parser.add_argument("--json", metavar="FILE", help="also store every seed's figure")
+    arguments = parser.parse_args()
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    stored = []
+    print(
+        "| setting | environment | steps | median return | 10 % to 90 % | must reach | |\n|---|---|---|---|---|---|---|"
+    )
+    with ProcessPoolExecutor() as pool:
+        for name in arguments.only or TABLES:
+            for case in TABLES[name]:
+                returns = list(pool.map(play, [case] * len(seeds), seeds))
+                low, median, high = np.quantile(returns, (0.1, 0.5, 0.9))
+                verdict = "" if case.target is None else "yes" if median >= case.target else "no"
+                print(
+                    f"| {case.what} | {case.env_id} | {case.steps:,} | {median:.1f} | {low:.1f} to {high:.1f} "
+                    f"| {'' if case.target is None else f'>= {case.target:g}'} | {verdict} |",
+                    flush=True,
+                )
+                stored.append({**case._asdict(), "seeds": list(seeds), "returns": returns})
+    print(
+        f"\nSeeds {seeds[0]} to {seeds[-1]}, {EPISODES} greedy episodes each. "
+        + ", ".join(f"{key} {value}" for key, value in describe().items())
+    )
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump({"machine": describe(), "cases": stored}, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()
