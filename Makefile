@@ -13,6 +13,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	$(BIN)/python -m pip check
+	$(BIN)/python -m sb3_knntd.kernels
 	touch $@
 
 demo: $(VENV)/installed  ## Train KNNTD on MountainCar-v0 and show what it learned

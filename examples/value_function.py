@@ -14,7 +14,7 @@ from sb3_knntd.plots import figure_of, plot_value_function
 def main() -> None:
     path = Path(sys.argv[1] if len(sys.argv) > 1 else "value_function.png")
     model = KNNTD("MountainCar-v0", seed=0)
-    model.learn(20_000)
+    model.learn(50_000)
     value_axes, _ = plot_value_function(model)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure_of(value_axes).savefig(path)

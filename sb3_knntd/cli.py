@@ -82,7 +82,7 @@ def _add_demo(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--env", default="MountainCar-v0", metavar="ID", help="gymnasium id (default: %(default)s)")
     parser.add_argument(
-        "--steps", type=positive_int, default=20_000, metavar="N", help="environment steps (default: %(default)s)"
+        "--steps", type=positive_int, default=50_000, metavar="N", help="environment steps (default: %(default)s)"
     )
     parser.add_argument("--seed", type=seed_int, default=0, metavar="N", help="random seed (default: %(default)s)")
     parser.add_argument(
