@@ -292,7 +292,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize(
     ("argv", "expected"),
-    [(["--help"], ["demo", "--version"]), (["demo", "--help"], ["--env", "--steps", "--seed", "--out", "20000"])],
+    [(["--help"], ["demo", "--version"]), (["demo", "--help"], ["--env", "--steps", "--seed", "--out", "50000"])],
 )
 def test_help(argv: list[str], expected: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as done:
