@@ -18,14 +18,14 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, safe_mean
 
 from sb3_knntd.checks import check_number, check_schedule, check_word
 from sb3_knntd.compiled_learner import CompiledLearner
-from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, Transition, check_finite, check_transition
+from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, check_finite, check_transition
 from sb3_knntd.memory import DenseTable
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
@@ -186,6 +186,7 @@ class KNNAlgorithm(BaseAlgorithm):
         self._check_parameters()
         self._setup_lr_schedule()
         self.trace_schedule = FloatSchedule(self.trace_decay)
+        self._trace_decay_is_constant = not callable(self.trace_decay)
         self.exploration_schedule = self._make_exploration_schedule()
         rule = self._make_rule()
         normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
@@ -305,8 +306,11 @@ class KNNAlgorithm(BaseAlgorithm):
         )
         self._measuring = self._must_measure()
         callback.on_training_start(locals(), globals())
+        # Telling nobody takes a thirtieth of the time of a step.
+        silent = isinstance(callback, ConvertCallback) and callback.callback is None
+        listener = None if silent else callback
         while self.num_timesteps < total_timesteps:
-            if not self._step(callback, log_interval):
+            if not self._step(listener, log_interval):
                 break
         callback.on_training_end()
         return self
@@ -328,67 +332,77 @@ class KNNAlgorithm(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         if total_timesteps > self.num_timesteps:
-            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
         return total_timesteps, callback
 
-    def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
+    def _step(self, callback: BaseCallback | None, log_interval: int | None) -> bool:
         """
         One step in every environment, and what is learned from it.
 
+        :param callback: who is told, if anybody
+        :param log_interval: number of episodes between logs
         :return: whether to go on
         """
         env = self.env
         assert env is not None
-        callback.on_rollout_start()
-        actions = self._random_actions() if self._measuring else self._current_actions()
+        if callback is not None:
+            callback.on_rollout_start()
+        actions = self._last_actions
+        if actions is None or self._measuring:
+            actions = self._random_actions() if self._measuring else self._first_actions()
         new_obs, rewards, dones, infos = env.step(self._env_actions(actions))
         n_before = self.num_timesteps
         self.num_timesteps += env.num_envs
-        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        self._current_progress_remaining = progress_remaining(self.num_timesteps, self._total_timesteps)
         try:
             ended = dones.tolist()
-            endings = self._endings(ended, infos) if True in ended else NO_ENDINGS
-            transition = Transition(new_obs, rewards, dones, *endings)  # type: ignore[arg-type]
+            truncated, last_obs = self._endings(ended, infos) if True in ended else NO_ENDINGS
             if self._measuring:
-                self._measure(transition)
+                self._measure(new_obs, rewards, last_obs)  # type: ignore[arg-type]
             else:
-                self._last_actions = self.learner.learn(transition, self._stream.next(), self._rates())
+                self._last_actions = self.learner.learn(
+                    new_obs,  # type: ignore[arg-type]
+                    rewards,
+                    dones,
+                    truncated,
+                    last_obs,
+                    self._stream.next(),
+                    self._rates(),
+                )
         except (ValueError, FloatingPointError) as error:
             step, self.num_timesteps = self.num_timesteps, n_before
             # What was going on in the environments is lost with this step: to go on is to begin anew.
             self._last_obs = self._last_actions = None
             raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
         self._last_obs = new_obs  # type: ignore[assignment]
-        self._update_info_buffer(infos, dones)
         n_logs = 0
         if True in ended:
+            self._update_info_buffer(infos, dones)
             before = self._episode_num
             self._episode_num += ended.count(True)
             n_logs = self._episode_num // log_interval - before // log_interval if log_interval else 0
 
-        callback.update_locals(locals())
-        if not callback.on_step():
-            return False
+        if callback is not None:
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
         if n_logs:
             self.dump_logs()
-        callback.on_rollout_end()
+        if callback is not None:
+            callback.on_rollout_end()
         return True
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # The last steps of several environments can go beyond the total.
-        self._current_progress_remaining = max(0.0, 1.0 - num_timesteps / total_timesteps)
 
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
-        self.exploration_rate = self.exploration_schedule(progress)
-        return self.lr_schedule(progress), self.trace_schedule(progress), self.exploration_rate
+        self.exploration_rate = rate = self.exploration_schedule(progress)
+        # Most keep λ as it is, and a call more is felt in steps this short.
+        trace_decay = self.trace_decay if self._trace_decay_is_constant else self.trace_schedule(progress)
+        return self.lr_schedule(progress), trace_decay, rate  # type: ignore[return-value]
 
-    def _current_actions(self) -> np.ndarray:
-        """The actions chosen in the last step, or at the start of the episodes."""
-        if self._last_actions is None:
-            assert isinstance(self._last_obs, np.ndarray)
-            uniforms = self._stream.next()[:, 0]
-            self._last_actions = self.learner.begin(self._last_obs, uniforms, self._rates()[2])
+    def _first_actions(self) -> np.ndarray:
+        """The actions chosen at the start of the episodes."""
+        assert isinstance(self._last_obs, np.ndarray)
+        self._last_actions = self.learner.begin(self._last_obs, self._stream.next()[:, 0], self._rates()[2])
         return self._last_actions
 
     @staticmethod
@@ -414,11 +428,10 @@ class KNNAlgorithm(BaseAlgorithm):
         n_actions = self.policy.table.n_actions
         return (self._stream.next()[:, 0, 0] * n_actions).astype(np.int64)
 
-    def _measure(self, transition: Transition) -> None:
-        check_transition(transition)
-        observations = transition.observations
-        if transition.truncated:
-            observations = np.concatenate((observations, transition.last_observations))
+    def _measure(self, observations: np.ndarray, rewards: np.ndarray, last_observations: np.ndarray) -> None:
+        check_transition(observations, rewards)
+        if len(last_observations):
+            observations = np.concatenate((observations, last_observations))
         self.policy.perceiver.measure(th.from_numpy(observations).to(self.device))
         self._n_measured += self.n_envs
         self._measuring = self._must_measure()
@@ -532,6 +545,15 @@ class KNNAlgorithm(BaseAlgorithm):
         for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
             stream.set_state(state)
         return model
+
+
+def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
+    """
+    :param num_timesteps: steps so far; the last of several environments can go beyond the total
+    :param total_timesteps: steps in all
+    :return: the share that remains, from 1 to 0
+    """
+    return 1.0 - num_timesteps / total_timesteps if num_timesteps < total_timesteps else 0.0
 
 
 def _read_data(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:

@@ -8,10 +8,13 @@ import numpy as np
 import torch as th
 
 from sb3_knntd.kernels import step as kernel
-from sb3_knntd.learner import DIVERGENCE, Form, Learner, Rates, Transition, check_finite, check_transition
+from sb3_knntd.kernels.desk import set_desk
+from sb3_knntd.learner import DIVERGENCE, Form, Learner, Rates, check_finite, check_transition
 from sb3_knntd.memory import LiveStore, QTable
 from sb3_knntd.perception import Perceiver
 from sb3_knntd.rules import DiscreteRule
+
+FLOAT32 = np.dtype(np.float32)
 
 
 class CompiledLearner(Learner):
@@ -30,66 +33,74 @@ class CompiledLearner(Learner):
         self.table = table
         self.n_envs = n_envs
         self.live = LiveStore(table, n_envs)
-        self._gamma = float(form.gamma)
-        self._form = (form.normalized, form.accumulating, form.reset_other_actions)
         self._rule = rule.kernel_arguments()
-        self._obs_dim, self._k = perceiver.bounds.obs_dim, perceiver.search.n_neighbors
+        self._form = tuple(form)
+        k, obs_dim = perceiver.search.n_neighbors, perceiver.bounds.obs_dim
+        self._most_new_points = n_envs * k
+        self._indices = np.zeros((3, n_envs, k), np.int64)
+        self._probabilities = np.zeros((3, n_envs, k))
+        actions = np.zeros((3, n_envs), np.int64)
+        self._actions: np.ndarray = actions[kernel.NOW]
         self._truncated = np.zeros(n_envs, np.bool_)
-        self._endings = self._truncated, np.zeros((n_envs, self._obs_dim))
-        shape = (3, n_envs, self._k)
-        self._states = np.zeros(shape, np.int64), np.zeros(shape), np.zeros(shape[:2], np.int64)
-        self._actions: np.ndarray = self._states[2][kernel.NOW]
+        self._last_observations = np.zeros((n_envs, obs_dim))
+        self._episodes = self._indices, self._probabilities, actions, self._truncated, self._last_observations
         self._sums = np.zeros(2)
         self._n_sums = 0
-        self._take_stock()
+        corrections, places = np.zeros(n_envs), np.zeros((n_envs, k), np.int64)
+        self._work = self._sums, np.zeros((2, table.n_actions)), corrections, places
+        self._set_desk()
 
-    def _take_stock(self) -> None:
-        """Take up the memory as it is now, and reckon for how many steps there is room in it."""
-        self._memory = self.live.memory()
-        self._steps_of_room = min(self.live.room, self.table.room) // (self.n_envs * self._k)
+    def _set_desk(self) -> None:
+        """Take up perception and memory as they are now, and reckon for how many steps there is room."""
+        self._eyes = self.perceiver.eyes
+        memory = self.live.memory()
+        self._desk = set_desk(self._eyes, self._rule, self._form, self._episodes, memory, self._work)
+        self._steps_of_room = min(self.live.room, self.table.room) // self._most_new_points
+
+    def _make_room(self) -> None:
+        changed = self.table.reserve(self._most_new_points)
+        if self.live.reserve(self._most_new_points) or changed:
+            self._set_desk()
+        self._steps_of_room = min(self.live.room, self.table.room) // self._most_new_points
 
     def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
         check_finite("an observation", observations, range(self.n_envs))
         self.live.clear()
-        self._take_stock()
-        seen, eyes = self._seen(observations), self.perceiver.eyes
+        self._set_desk()
+        seen = as_rows(observations)
         self._find(seen, kernel.NOW)
-        kernel.begin(seen, uniforms, rate, eyes, self._rule, self._states, self._memory)
+        kernel.begin(self._desk, seen, uniforms, rate)
         return self._actions.copy()
 
-    def learn(self, transition: Transition, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
-        observations, rewards, ended, truncated, last_observations = transition
+    def learn(
+        self,
+        observations: np.ndarray,
+        rewards: np.ndarray,
+        ended: np.ndarray,
+        truncated: list[int],
+        last_observations: np.ndarray,
+        uniforms: np.ndarray,
+        rates: Rates,
+    ) -> np.ndarray:
+        if self.perceiver.eyes is not self._eyes:
+            self._set_desk()
         if self._steps_of_room == 0:
-            self.table.reserve(self.n_envs * self._k)
-            self.live.reserve(self.n_envs * self._k)
-            self._take_stock()
+            self._make_room()
         self._steps_of_room -= 1
         self.live.is_published = False
-        seen, eyes = self._seen(observations), self.perceiver.eyes
+        seen = observations if observations.dtype is FLOAT32 and observations.ndim == 2 else as_rows(observations)
         if self.perceiver.search_is_outside:
-            check_transition(transition)
+            check_transition(observations, rewards)
             self._find(seen, kernel.THEN)
         if truncated:
             self._truncated[truncated] = True
-            self._endings[1][truncated] = self._seen(last_observations)
-            self._find(self._endings[1][truncated], kernel.LAST, truncated)
-        answer = kernel.learn(
-            (seen, rewards, ended),
-            self._endings,
-            uniforms,
-            rates,
-            self._gamma,
-            self._form,
-            eyes,
-            self._rule,
-            self._states,
-            self._memory,
-            self._sums,
-        )
+            self._last_observations[truncated] = as_rows(last_observations)
+            self._find(self._last_observations[truncated], kernel.LAST, truncated)
+        answer = kernel.learn(self._desk, seen, rewards, ended, uniforms, rates)
         if truncated:
             self._truncated[:] = False
         if answer == kernel.NOT_FINITE:
-            check_transition(transition)
+            check_transition(observations, rewards)
         if answer == kernel.DIVERGED:
             raise FloatingPointError(DIVERGENCE)
         self._n_sums += self.n_envs
@@ -104,33 +115,36 @@ class CompiledLearner(Learner):
         return {"td_error": td_error, "q_mean": q_mean}
 
     def state_dict(self) -> dict[str, Any]:
-        indices, probabilities, actions = (th.from_numpy(array[kernel.NOW].copy()) for array in self._states)
+        indices = th.from_numpy(self._indices[kernel.NOW].copy())
         return {
             "indices": indices,
-            "probabilities": probabilities,
-            "entries": actions[:, None].expand(indices.shape).contiguous(),
+            "probabilities": th.from_numpy(self._probabilities[kernel.NOW].copy()),
+            "entries": th.from_numpy(self._actions.copy())[:, None].expand(indices.shape).contiguous(),
             "traces": self.live.state(),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
         self.live.forget()
         if len(state_dict["indices"]) == self.n_envs:
-            indices, probabilities, _ = self._states
-            indices[kernel.NOW] = state_dict["indices"].numpy()
-            probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
+            self._indices[kernel.NOW] = state_dict["indices"].numpy()
+            self._probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
             self._actions[:] = state_dict["entries"][:, 0].numpy()
             self.live.set_state(state_dict["traces"])
-        self._take_stock()
-
-    def _seen(self, observations: np.ndarray) -> np.ndarray:
-        """Observations as the kernel takes them: (batch, obs_dim), in one of two types, so that two are compiled."""
-        if observations.dtype != np.float32:
-            observations = observations.astype(np.float64, copy=False)
-        return observations if observations.ndim == 2 else observations[:, None]
+        self._set_desk()
 
     def _find(self, observations: np.ndarray, state: int, rows: Any = slice(None)) -> None:
         """Have the neighbours found by a search that the kernel does not have in it."""
         if self.perceiver.search_is_outside:
             neighbors = self.perceiver.find(th.from_numpy(observations))
-            self._states[0][state, rows] = neighbors.indices.numpy()
-            self._states[1][state, rows] = neighbors.squared_distances.numpy()
+            self._indices[state, rows] = neighbors.indices.numpy()
+            self._probabilities[state, rows] = neighbors.squared_distances.numpy()
+
+
+def as_rows(observations: np.ndarray) -> np.ndarray:
+    """
+    :param observations: shape (batch, obs_dim), or (batch,) for Discrete, any number type
+    :return: the same, shape (batch, obs_dim), in one of two types, so that the kernels are compiled for no more
+    """
+    if observations.dtype is not FLOAT32:
+        observations = observations.astype(np.float64, copy=False)
+    return observations if observations.ndim == 2 else observations[:, None]

@@ -13,25 +13,6 @@ from sb3_knntd.memory import DenseTable, Traces
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.rules import ActionRule, Choice
 
-
-class Transition(NamedTuple):
-    """
-    What the environments answered to the last actions.
-
-    :param observations: what each sees now (after a reset where an episode ended), shape (n_envs, *obs_shape)
-    :param rewards: shape (n_envs,)
-    :param ended: whether the episode ended, shape (n_envs,), bool
-    :param truncated: the environments whose episode ended by a time limit, rising
-    :param last_observations: the true last observation of each of these, shape (len(truncated), *obs_shape)
-    """
-
-    observations: np.ndarray
-    rewards: np.ndarray
-    ended: np.ndarray
-    truncated: list[int]
-    last_observations: np.ndarray
-
-
 #: The scheduled parameters at one step: α, λ, and ε or the temperature.
 Rates = tuple[float, float, float]
 
@@ -73,11 +54,25 @@ class Learner(ABC):
         """
 
     @abstractmethod
-    def learn(self, transition: Transition, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
+    def learn(
+        self,
+        observations: np.ndarray,
+        rewards: np.ndarray,
+        ended: np.ndarray,
+        truncated: list[int],
+        last_observations: np.ndarray,
+        uniforms: np.ndarray,
+        rates: Rates,
+    ) -> np.ndarray:
         """
         Learn from what the last actions led to, and choose the next.
 
-        :param transition: what the environments answered
+        :param observations: what each environment shows now (after a reset where an episode ended), shape
+            (n_envs, *obs_shape)
+        :param rewards: shape (n_envs,)
+        :param ended: whether the episode ended, shape (n_envs,), bool
+        :param truncated: the environments whose episode ended by a time limit, rising
+        :param last_observations: the true last observation of each of these, shape (len(truncated), *obs_shape)
         :param uniforms: random numbers in [0, 1), shape (n_envs, 2, n_uniforms): for the next action, and for
             the one that would have been taken at a truncation
         :param rates: the scheduled parameters
@@ -124,15 +119,14 @@ def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
         raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
 
 
-def check_transition(transition: Transition) -> None:
+def check_transition(observations: np.ndarray, rewards: np.ndarray) -> None:
     """
-    :param transition: what the environments answered
+    :param observations: a row for each environment
+    :param rewards: one for each environment
     :raises ValueError: if an observation or reward is not finite; the message says where
     """
-    everyone = range(len(transition.ended))
-    check_finite("an observation", transition.observations, everyone)
-    check_finite("a reward", transition.rewards, everyone)
-    check_finite("a last observation", transition.last_observations, transition.truncated)
+    check_finite("an observation", observations, range(len(rewards)))
+    check_finite("a reward", rewards, range(len(rewards)))
 
 
 DIVERGENCE = (
@@ -173,16 +167,25 @@ class TorchLearner(Learner):
         perception, choice = self._choose(observations, uniforms, rate)
         return self._settle_in(perception, choice)
 
-    def learn(self, transition: Transition, uniforms: np.ndarray, rates: Rates) -> np.ndarray:
-        check_transition(transition)
-        perception, choice = self._choose(transition.observations, uniforms[:, 0], rates[2])
-        worth = choice.values * self._tensor(~transition.ended)
-        if transition.truncated:
-            _, last = self._choose(transition.last_observations, uniforms[transition.truncated, 1], rates[2])
-            worth[transition.truncated] = last.values
+    def learn(
+        self,
+        observations: np.ndarray,
+        rewards: np.ndarray,
+        ended: np.ndarray,
+        truncated: list[int],
+        last_observations: np.ndarray,
+        uniforms: np.ndarray,
+        rates: Rates,
+    ) -> np.ndarray:
+        check_transition(observations, rewards)
+        perception, choice = self._choose(observations, uniforms[:, 0], rates[2])
+        worth = choice.values * self._tensor(~ended)
+        if truncated:
+            _, last = self._choose(last_observations, uniforms[truncated, 1], rates[2])
+            worth[truncated] = last.values
 
         value = self._value()
-        errors = self._tensor(transition.rewards).to(worth.dtype) + self.form.gamma * worth - value
+        errors = self._tensor(rewards).to(worth.dtype) + self.form.gamma * worth - value
         corrections = rates[0] * errors
         if self.form.normalized:
             corrections = corrections / self.probabilities.square().sum(dim=1)
@@ -192,7 +195,7 @@ class TorchLearner(Learner):
 
         self.traces.mark(self.indices, self.entries, self.probabilities)
         self.traces.credit(corrections)
-        self.traces.decay(self.form.gamma * rates[1], self._tensor(transition.ended))
+        self.traces.decay(self.form.gamma * rates[1], self._tensor(ended))
         self.table.visited[self.indices] = True
         self._sums += th.stack((errors.abs().sum(), value.sum()))
         self._n_sums += self.n_envs

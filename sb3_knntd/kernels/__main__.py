@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch as th
 
 from sb3_knntd import KNNTD
 
 
 def main() -> None:
-    """Learn and predict one step with each type of table."""
-    for dtype in (th.float64, th.float32):
-        model = KNNTD("MountainCar-v0", policy_kwargs={"dtype": dtype}).learn(1)
-        model.predict(model.observation_space.sample(), deterministic=True)
+    """Learn and predict one step with each type of table and of observations."""
+    for env_id, dtype in (
+        ("MountainCar-v0", th.float64),
+        ("MountainCar-v0", th.float32),
+        ("FrozenLake-v1", th.float64),
+    ):
+        model = KNNTD(env_id, policy_kwargs={"dtype": dtype}).learn(1)
+        model.predict(np.asarray(model.observation_space.sample()), deterministic=True)
 
 
 if __name__ == "__main__":

@@ -114,82 +114,100 @@ def choose(values, uniforms, rate, target, exploration, random_ties, shares):
 
 
 @jit
-def begin(observations, uniforms, rate, eyes, rule, states, memory):
+def perceive_and_choose(observation, uniforms, rate, state, env, desk):
     """
-    Perceive and choose where every environment begins an episode.
+    Perceive what an environment shows, and choose; both are noted on the desk.
 
-    :param observations: observation units, shape (n_envs, obs_dim)
-    :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
+    :param observation: observation units, shape (obs_dim,)
+    :param uniforms: random numbers in [0, 1), shape (n_uniforms,)
     :param rate: ε or the temperature
-    :param eyes: see :func:`~sb3_knntd.kernels.perceive.perceive`
-    :param rule: (target, exploration, random_ties) of :func:`choose`
-    :param states: see :func:`learn`; that of the current state is filled
-    :param memory: see :func:`learn`
+    :param state: ``NOW``, ``THEN`` or ``LAST``
+    :param env: which environment
+    :param desk: see :mod:`sb3_knntd.kernels.desk`
+    :return: what the state is worth as a target
     """
-    low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
-    target, exploration, random_ties = rule
-    indices, probabilities, actions = states
-    values, _, _, row_slots, initial, _, live, live_slots, _, pace = memory
-    means, shares = np.empty(live.shape[1]), np.empty(live.shape[1])
-    for env in range(len(observations)):
-        here, there = indices[NOW, env], probabilities[NOW, env]
-        perceive(observations[env], low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there)
-        add_rows(here, there, values, row_slots, initial, live, live_slots, pace, means)
-        actions[NOW, env], _ = choose(means, uniforms[env], rate, target, exploration, random_ties, shares)
+    indices, probabilities, means = desk.indices[state, env], desk.probabilities[state, env], desk.means[0]
+    perceive(
+        observation,
+        desk.low,
+        desk.width,
+        desk.limit,
+        desk.search,
+        desk.axes,
+        desk.offsets,
+        desk.columns,
+        desk.weights,
+        desk.bandwidth,
+        indices,
+        probabilities,
+    )
+    add_rows(
+        indices,
+        probabilities,
+        desk.values,
+        desk.row_slots,
+        desk.initial,
+        desk.live,
+        desk.live_slots,
+        desk.pace,
+        means,
+    )
+    action, worth = choose(means, uniforms, rate, desk.target, desk.exploration, desk.random_ties, desk.means[1])
+    desk.actions[state, env] = action
+    return worth
 
 
 @jit
-def learn(answers, endings, uniforms, rates, gamma, form, eyes, rule, states, memory, sums):
+def begin(desk, observations, uniforms, rate):
+    """
+    Perceive and choose where every environment begins an episode.
+
+    :param desk: see :mod:`sb3_knntd.kernels.desk`
+    :param observations: observation units, shape (n_envs, obs_dim)
+    :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
+    :param rate: ε or the temperature
+    """
+    for env in range(len(observations)):
+        perceive_and_choose(observations[env], uniforms[env], rate, NOW, env, desk)
+
+
+@jit
+def learn(desk, observations, rewards, ended, uniforms, rates):
     """
     Perceive, choose, compute the TD errors and credit them (Algorithm 3), in all environments at once: every
     value is read before any is changed.
 
-    :param answers: (observations, rewards, ended) of the environments, shapes (n_envs, obs_dim) and (n_envs,) twice
-    :param endings: (truncated, last observations): whether an episode ended by truncation, shape (n_envs,), and if so
-        what was seen last, shape (n_envs, obs_dim)
+    :param desk: see :mod:`sb3_knntd.kernels.desk`
+    :param observations: observation units, shape (n_envs, obs_dim)
+    :param rewards: shape (n_envs,)
+    :param ended: whether the episodes have, shape (n_envs,), bool
     :param uniforms: random numbers in [0, 1), shape (n_envs, 2, n_uniforms)
     :param rates: (α, λ, ε or temperature)
-    :param gamma: γ
-    :param form: (normalized step, accumulating traces, reset other actions), bools
-    :param eyes: see :func:`~sb3_knntd.kernels.perceive.perceive`
-    :param rule: (target, exploration, random_ties) of :func:`choose`
-    :param states: (indices, probabilities, actions), shapes (3, n_envs, k) twice and (3, n_envs): of the state that
-        each environment left, ``NOW``, of the one it is in, ``THEN``, and of the ``LAST`` one before a truncation
-    :param memory: (values, visited, row_points, row_slots, initial, live_points, live, live_slots, counts, pace), see
-        :mod:`sb3_knntd.kernels.memory`
-    :param sums: sums of the errors' sizes and of the values, to be added to, shape (2,)
     :return: ``FINE``; or ``NOT_FINITE`` or ``DIVERGED``, and then no value has been changed
     """
-    observations, rewards, ended = answers
-    truncated, last_observations = endings
     learning_rate, trace_decay, rate = rates
-    normalized, accumulating, reset_others = form
-    low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
-    target, exploration, random_ties = rule
-    indices, probabilities, actions = states
-    values, visited, row_points, row_slots, initial, live_points, live, live_slots, counts, pace = memory
-    n_envs, k = indices.shape[1], indices.shape[2]
-    n_dims, n_actions = len(low), live.shape[1]
-    means, shares = np.empty(n_actions), np.empty(n_actions)
-    corrections = np.empty(n_envs)
-    places = np.empty((n_envs, k), np.int64)
+    values, visited, row_points, row_slots = desk.values, desk.visited, desk.row_points, desk.row_slots
+    live_points, live, live_slots, counts, pace = (
+        desk.live_points,
+        desk.live,
+        desk.live_slots,
+        desk.counts,
+        desk.pace,
+    )
+    indices, probabilities, actions = desk.indices, desk.probabilities, desk.actions
+    places, corrections = desk.places, desk.corrections
+    n_envs, k, n_actions = indices.shape[1], indices.shape[2], live.shape[1]
     size, value_sum = 0.0, 0.0
 
     for env in range(n_envs):
         if not np.isfinite(rewards[env]):
             return NOT_FINITE
-        for j in range(n_dims):
+        for j in range(observations.shape[1]):
             if not np.isfinite(observations[env, j]):
                 return NOT_FINITE
-        here, there = indices[THEN, env], probabilities[THEN, env]
-        perceive(observations[env], low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there)
-        add_rows(here, there, values, row_slots, initial, live, live_slots, pace, means)
-        actions[THEN, env], worth = choose(means, uniforms[env, 0], rate, target, exploration, random_ties, shares)
-        if truncated[env]:
-            here, there, seen = indices[LAST, env], probabilities[LAST, env], last_observations[env]
-            perceive(seen, low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there)
-            add_rows(here, there, values, row_slots, initial, live, live_slots, pace, means)
-            _, worth = choose(means, uniforms[env, 1], rate, target, exploration, random_ties, shares)
+        worth = perceive_and_choose(observations[env], uniforms[env, 0], rate, THEN, env, desk)
+        if desk.truncated[env]:
+            worth = perceive_and_choose(desk.last_observations[env], uniforms[env, 1], rate, LAST, env, desk)
         elif ended[env]:
             worth = 0.0
         value, squares = 0.0, 0.0
@@ -201,8 +219,8 @@ def learn(answers, endings, uniforms, rates, gamma, form, eyes, rule, states, me
             probability = probabilities[NOW, env, i]
             value += probability * total(live, place, actions[NOW, env], pace)
             squares += probability * probability
-        error = rewards[env] + gamma * worth - value
-        corrections[env] = learning_rate * error / squares if normalized else learning_rate * error
+        error = rewards[env] + desk.gamma * worth - value
+        corrections[env] = learning_rate * error / squares if desk.normalized else learning_rate * error
         if not np.isfinite(corrections[env]):
             return DIVERGED
         size += abs(error)
@@ -213,27 +231,29 @@ def learn(answers, endings, uniforms, rates, gamma, form, eyes, rule, states, me
         for i in range(k):
             place = places[env, i]
             trace = probabilities[NOW, env, i] / pace[0]
-            if accumulating:
+            if desk.accumulating:
                 trace += live[place, action, env]
-            elif reset_others:
+            elif desk.reset_others:
                 for other in range(n_actions):
                     if other != action:
                         set_trace(live, place, other, env, 0.0, pace)
             set_trace(live, place, action, env, trace, pace)
     for env in range(n_envs):
         pace[1 + env] += corrections[env] * pace[0]
-    pace[0] *= gamma * trace_decay
+    pace[0] *= desk.gamma * trace_decay
     for env in range(n_envs):
         if ended[env]:
             end_episode(env, values, row_slots, live_points, live, live_slots, counts, pace)
     if pace[0] < LEAST_CLOCK:
         settle(values, row_slots, live_points, live, live_slots, counts, pace)
 
-    sums[0] += size
-    sums[1] += value_sum
-    indices[NOW] = indices[THEN]
-    probabilities[NOW] = probabilities[THEN]
-    actions[NOW] = actions[THEN]
+    desk.sums[0] += size
+    desk.sums[1] += value_sum
+    for env in range(n_envs):
+        actions[NOW, env] = actions[THEN, env]
+        for i in range(k):
+            indices[NOW, env, i] = indices[THEN, env, i]
+            probabilities[NOW, env, i] = probabilities[THEN, env, i]
     return FINE
 
 

@@ -55,20 +55,23 @@ class LiveStore:
         """How many more points may come to life before :meth:`reserve` has to be called."""
         return len(self.points) - self.count
 
-    def reserve(self, n_points: int) -> None:
+    def reserve(self, n_points: int) -> bool:
         """
         Make room.
 
         :param n_points: how many points may come to life in the next step
+        :return: whether the arrays have been replaced
         """
         if self.room >= n_points:
-            return
+            return False
         values, _, _, row_slots, _, points, entries, slots, counts, pace = self.memory()
         settle(values, row_slots, points, entries, slots, counts, pace)
         wanted = 2 * self.count + n_points
-        if wanted > len(self.points):
-            self.set_state({**self.state(), "capacity": max(2 * len(self.points), wanted)})
-            self.is_published = False
+        if wanted <= len(self.points):
+            return False
+        self.set_state({**self.state(), "capacity": max(2 * len(self.points), wanted)})
+        self.is_published = False
+        return True
 
     def publish(self) -> None:
         """Write the values of the live points into the table."""

@@ -82,11 +82,12 @@ class QTable(nn.Module, ABC):
         """How many more points may be learned at before :meth:`reserve` has to be called."""
 
     @abstractmethod
-    def reserve(self, n_points: int) -> None:
+    def reserve(self, n_points: int) -> bool:
         """
         Make room.
 
         :param n_points: how many new points there may be in the next step
+        :return: whether the arrays have been replaced
         """
 
     @abstractmethod
@@ -136,8 +137,8 @@ class DenseTable(QTable):
     def room(self) -> int:
         return sys.maxsize
 
-    def reserve(self, n_points: int) -> None:
-        """Nothing to do: there is room for every point."""
+    def reserve(self, n_points: int) -> bool:
+        return False
 
     def arrays(self) -> tuple[Any, ...]:
         no_points, no_slots = np.empty(0, np.int64), np.empty((0, 2), np.int64)
@@ -191,9 +192,11 @@ class HashedTable(QTable):
     def room(self) -> int:
         return len(self.values) - self.n_visited
 
-    def reserve(self, n_points: int) -> None:
-        if self.room < n_points:
-            self._resize(max(2 * len(self.values), self.n_visited + n_points))
+    def reserve(self, n_points: int) -> bool:
+        if self.room >= n_points:
+            return False
+        self._resize(max(2 * len(self.values), self.n_visited + n_points))
+        return True
 
     def arrays(self) -> tuple[Any, ...]:
         return self.values.numpy(), self.visited.numpy(), self.row_points.numpy(), self._slots, self.initial_value

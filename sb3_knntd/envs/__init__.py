@@ -1,0 +1,24 @@
+"""
+The paper's environments. Importing this module registers them with gymnasium; where nothing imports it, as in the
+processes of a SubprocVecEnv, ``gymnasium.make("sb3_knntd.envs:sb3_knntd/MountainCar-v0")`` does.
+"""
+
+from __future__ import annotations
+
+import gymnasium as gym
+
+from sb3_knntd.envs.acrobot import AcrobotEnv
+from sb3_knntd.envs.cart_pole import CartPoleEnv, ContinuousCartPoleEnv
+from sb3_knntd.envs.mountain_car import MountainCarEnv
+
+__all__ = ["AcrobotEnv", "CartPoleEnv", "ContinuousCartPoleEnv", "MountainCarEnv"]
+
+for _id, _entry_point, _steps in (
+    ("sb3_knntd/MountainCar-v0", "sb3_knntd.envs.mountain_car:MountainCarEnv", 1000),
+    ("sb3_knntd/CartPole-v0", "sb3_knntd.envs.cart_pole:CartPoleEnv", 1000),
+    ("sb3_knntd/ContinuousCartPole-v0", "sb3_knntd.envs.cart_pole:ContinuousCartPoleEnv", 1000),
+    ("sb3_knntd/Acrobot-v0", "sb3_knntd.envs.acrobot:AcrobotEnv", 500),
+):
+    # A module that is loaded again would only make gymnasium warn.
+    if _id not in gym.registry:
+        gym.register(_id, entry_point=_entry_point, max_episode_steps=_steps)

@@ -1,0 +1,211 @@
+"""The Mountain-Car: an engine weaker than gravity, which has to gain height on the left to leave on the right."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sb3_knntd.checks import check_word
+from sb3_knntd.envs.base import PaperEnv, State
+from sb3_knntd.envs.rendering import BLUE, GREEN, GROUND, INK, ORANGE, SKY, STEEL, Canvas, turned
+
+MIN_POSITION = -1.2
+MAX_POSITION = 0.6
+MAX_SPEED = 0.07
+GOAL_POSITION = 0.5
+FORCE = 0.001
+GRAVITY = 0.0025
+
+
+def mountain_car_step(state: tuple[float, float], action: int) -> tuple[float, float]:
+    """
+    One step of the standard Mountain-Car (Sutton and Barto, "Reinforcement Learning", 2nd edition, example 10.1).
+
+    Numba compiles it as it stands.
+
+    :param state: position in [-1.2, 0.6] and velocity in [-0.07, 0.07], position units a step
+    :param action: 0, 1 or 2 for an engine pushing left, idle or pushing right
+    :return: the state after the step
+    """
+    position, velocity = state[0], state[1]
+    velocity += FORCE * (action - 1) - GRAVITY * math.cos(3.0 * position)
+    velocity = min(max(velocity, -MAX_SPEED), MAX_SPEED)
+    position = min(max(position + velocity, MIN_POSITION), MAX_POSITION)
+    if position == MIN_POSITION and velocity < 0.0:
+        velocity = 0.0
+    return position, velocity
+
+
+class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
+    """
+    ## Description
+
+    A car stands in a valley. Its engine is weaker than gravity on the slopes, so the way up the hill on the right
+    leads through the one on the left. It is the task of the paper's figure 3, which claims 105 steps an episode
+    from episode 44 on; from the fixed start the shortest way takes 102.
+
+    `gymnasium`'s `MountainCar-v0` has the same dynamics, starts elsewhere and ends after 200 steps.
+
+    ## Action Space
+
+    `Discrete(3)`
+
+    | Num | Action               |
+    |-----|----------------------|
+    | 0   | engine pushes left   |
+    | 1   | engine idles         |
+    | 2   | engine pushes right  |
+
+    ## Observation Space
+
+    `Box` of shape `(2,)`, float32
+
+    | Num | Observation | Min   | Max  | Unit                 |
+    |-----|-------------|-------|------|----------------------|
+    | 0   | position    | -1.2  | 0.6  | of length            |
+    | 1   | velocity    | -0.07 | 0.07 | of length a step     |
+
+    ## Dynamics
+
+    *v ← v + 0.001 (action - 1) - 0.0025 cos(3 x)*, limited to [-0.07, 0.07]; then *x ← x + v*, limited to [-1.2, 0.6].
+    The wall at -1.2 takes all speed.
+
+    ## Rewards
+
+    | `reward`           | each step | on reaching the goal |
+    |--------------------|-----------|----------------------|
+    | `"step"` (default) | -1        | -1                   |
+    | `"goal"`           | 0         | 1                    |
+
+    ## Starting State
+
+    | `start`             | position                | velocity                 |
+    |---------------------|-------------------------|--------------------------|
+    | `"fixed"` (default) | -0.5                    | 0                        |
+    | `"uniform"`         | uniform in [-0.6, -0.4] | 0                        |
+    | `"anywhere"`        | uniform in [-1.2, 0.5]  | uniform in [-0.07, 0.07] |
+    | a state             | as given                | as given                 |
+
+    ## Episode End
+
+    1. Termination: position ≥ 0.5.
+    2. Truncation, as registered: 1000 steps.
+
+    ## Arguments
+
+    | Parameter     | Type                | Default   | Description                                                    |
+    |---------------|---------------------|-----------|----------------------------------------------------------------|
+    | `start`       | str or 2 numbers    | `"fixed"` | where episodes start                                           |
+    | `reward`      | str                 | `"step"`  | what is rewarded                                               |
+    | `noise`       | number or 2 numbers | `0.0`     | of the observations: standard deviation / (Max - Min)          |
+    | `render_mode` | str                 | `None`    | `"human"` or `"rgb_array"`                                     |
+
+    `reset` takes `options={"state": (position, velocity)}`, or `{"low": ..., "high": ...}` for limits of the
+    position. With noise, `info["state"]` holds the state without it.
+
+    ```python
+    >>> import gymnasium as gym
+    >>> import sb3_knntd.envs
+    >>> env = gym.make("sb3_knntd/MountainCar-v0", start="uniform", noise=0.02)
+
+    ```
+
+    ## Version History
+
+    * v0: first version
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+
+    drawn_dimensions: ClassVar[slice] = slice(0, 1)
+
+    def __init__(
+        self,
+        start: str | Sequence[float] = "fixed",
+        reward: str = "step",
+        noise: float | Sequence[float] = 0.0,
+        render_mode: str | None = None,
+    ) -> None:
+        check_word("reward", reward, ("step", "goal"))
+        super().__init__(
+            observation_space=spaces.Box(
+                np.array([MIN_POSITION, -MAX_SPEED], dtype=np.float32),
+                np.array([MAX_POSITION, MAX_SPEED], dtype=np.float32),
+            ),
+            ranges=(MAX_POSITION - MIN_POSITION, 2.0 * MAX_SPEED),
+            starts={
+                "fixed": ((-0.5, 0.0), (-0.5, 0.0)),
+                "uniform": ((-0.6, 0.0), (-0.4, 0.0)),
+                "anywhere": ((MIN_POSITION, -MAX_SPEED), (GOAL_POSITION, MAX_SPEED)),
+            },
+            start=start,
+            noise=noise,
+            render_mode=render_mode,
+        )
+        self.action_space = spaces.Discrete(3)
+        self.reward = reward
+        self._push = 0
+
+    def step(self, action: int | np.integer[Any]) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """
+        :param action: 0, 1 or 2
+        :return: observation, reward, terminated, truncated (never), info
+        :raises ValueError: if the action is another
+        """
+        state = self._known_state()
+        if not self.action_space.contains(action):
+            raise ValueError(f"action must be 0, 1 or 2; got {action!r}")
+        self._push = int(action) - 1
+        self.state = position, _ = mountain_car_step((state[0], state[1]), int(action))
+        arrived = position >= GOAL_POSITION
+        reward = float(arrived) if self.reward == "goal" else -1.0
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), reward, arrived, False, self._info()
+
+    def _on_reset(self) -> None:
+        self._push = 0
+
+    def _make_canvas(self, human: bool) -> Canvas:
+        return Canvas(
+            (600, 400), (-0.32, 0.62), 600 / 2.1, human=human, fps=self.metadata["render_fps"], caption="Mountain-Car"
+        )
+
+    def _draw(self, canvas: Canvas, state: State) -> None:
+        position = state[0]
+        canvas.fill(SKY)
+        places = np.linspace(-1.4, 0.8, 147).tolist()
+        ridge = [(x, _height(x)) for x in places]
+        canvas.polygon([(places[0], -1.0), *ridge, (places[-1], -1.0)], GROUND)
+        canvas.path(ridge, 0.012, STEEL)
+
+        wall = MIN_POSITION - 0.12
+        canvas.bar((wall, _height(wall)), (wall, _height(wall) + 0.16), 0.025, INK)
+
+        top = _height(GOAL_POSITION) + 0.25
+        canvas.bar((GOAL_POSITION, _height(GOAL_POSITION)), (GOAL_POSITION, top), 0.012, INK)
+        canvas.polygon([(GOAL_POSITION, top), (GOAL_POSITION + 0.12, top - 0.04), (GOAL_POSITION, top - 0.08)], GREEN)
+
+        slope = math.atan(_slope(position))
+        ground = (position, _height(position))
+        body = [(-0.11, 0.04), (0.11, 0.04), (0.11, 0.08), (0.06, 0.1), (0.03, 0.16), (-0.06, 0.16), (-0.1, 0.1)]
+        canvas.polygon(turned(body, slope, ground), BLUE)
+        for wheel in turned([(-0.065, 0.038), (0.065, 0.038)], slope, ground):
+            canvas.circle(wheel, 0.034, INK)
+            canvas.circle(wheel, 0.013, GROUND)
+        if self._push:
+            tail, tip = turned([(0.0, 0.21), (0.14 * self._push, 0.21)], slope, ground)
+            canvas.arrow(tail, tip, 0.014, ORANGE)
+
+
+def _height(position: float) -> float:
+    return 0.55 + 0.45 * math.sin(3.0 * position)
+
+
+def _slope(position: float) -> float:
+    return 1.35 * math.cos(3.0 * position)

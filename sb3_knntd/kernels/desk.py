@@ -1,0 +1,110 @@
+"""
+All that lies before the learner while it works, as one object: numba takes in an object of any number of arrays as
+fast as one array.
+
+perception     ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`: low, width, limit, search, axes, offsets,
+               columns, weights, bandwidth
+choice         target, exploration, random_ties of :func:`sb3_knntd.kernels.step.choose`
+update         gamma, normalized (step), accumulating (traces), reset_others
+episodes       indices, probabilities (3, n_envs, k) and actions (3, n_envs): of the state that each environment left,
+               ``NOW``, of the one it is in, ``THEN``, and of the ``LAST`` one before a truncation; truncated (n_envs,)
+               and last_observations (n_envs, obs_dim): which episodes were, and what was seen last
+memory         the arrays of :mod:`sb3_knntd.kernels.memory`
+log            sums of the TD errors' sizes and of the values, (2,)
+work           values (2, n_actions), corrections (n_envs,), places (n_envs, k), to be used
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+
+from sb3_knntd.kernels.jit import AVAILABLE, jit
+
+EYES = ("low", "width", "limit", "search", "axes", "offsets", "columns", "weights", "bandwidth")
+RULE = ("target", "exploration", "random_ties")
+FORM = ("gamma", "normalized", "accumulating", "reset_others")
+EPISODES = ("indices", "probabilities", "actions", "truncated", "last_observations")
+MEMORY = (
+    "values",
+    "visited",
+    "row_points",
+    "row_slots",
+    "initial",
+    "live_points",
+    "live",
+    "live_slots",
+    "counts",
+    "pace",
+)
+WORK = ("sums", "means", "corrections", "places")
+FIELDS = (*EYES, *RULE, *FORM, *EPISODES, *MEMORY, *WORK)
+
+if AVAILABLE:
+    from numba.core import types
+    from numba.experimental import structref
+
+    @structref.register
+    class DeskType(types.StructRef):
+        """numba's type of a desk: that of its fields."""
+
+        def preprocess_fields(self, fields):
+            """A field is a variable, whatever constant it was made of."""
+            return tuple((name, types.unliteral(field)) for name, field in fields)
+
+    class Desk(structref.StructRefProxy):
+        """A desk as Python sees it, made of the values of ``FIELDS`` in their order."""
+
+        def __new__(cls, *fields):
+            return structref.StructRefProxy.__new__(cls, *fields)
+
+    structref.define_proxy(Desk, DeskType, FIELDS)
+else:
+    Desk = namedtuple("Desk", FIELDS)  # type: ignore[no-redef, misc]
+
+
+@jit
+def set_desk(eyes, rule, form, episodes, memory, work):
+    """A desk of the fields named above; compiled, as that is what numba keeps on disk."""
+    low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
+    target, exploration, random_ties = rule
+    gamma, normalized, accumulating, reset_others = form
+    indices, probabilities, actions, truncated, last_observations = episodes
+    values, visited, row_points, row_slots, initial, live_points, live, live_slots, counts, pace = memory
+    sums, means, corrections, places = work
+    return Desk(
+        low,
+        width,
+        limit,
+        search,
+        axes,
+        offsets,
+        columns,
+        weights,
+        bandwidth,
+        target,
+        exploration,
+        random_ties,
+        gamma,
+        normalized,
+        accumulating,
+        reset_others,
+        indices,
+        probabilities,
+        actions,
+        truncated,
+        last_observations,
+        values,
+        visited,
+        row_points,
+        row_slots,
+        initial,
+        live_points,
+        live,
+        live_slots,
+        counts,
+        pace,
+        sums,
+        means,
+        corrections,
+        places,
+    )
