@@ -379,6 +379,7 @@ BENCHMARKS: dict[str, Callable[[int], Row | list[Row]]] = {
     "memory64": lambda repeats: memory(repeats, th.float64),
     "memory32": lambda repeats: memory(repeats, th.float32),
     "growth": growth_pause,
+    "cuda": cuda,
 }
 
 

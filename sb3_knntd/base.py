@@ -226,7 +226,7 @@ class KNNAlgorithm(BaseAlgorithm):
             assert isinstance(rule, DiscreteRule)
             return CompiledLearner(perceiver, table, rule, self.n_envs, form)
         assert isinstance(table, DenseTable)
-        return TorchLearner(perceiver, table, rule, self.n_envs, form)
+        return TorchLearner(perceiver, table, rule, self.n_envs, form, one_step=self.trace_decay == 0.0)
 
     def _check_parameters(self) -> None:
         self.learning_rate = check_schedule("learning_rate", self.learning_rate, 0.0)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_knntd.memory import DenseTable, Traces
+from sb3_knntd.memory import DenseTable, DenseTraces, OneStepTraces, Traces
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.rules import ActionRule, Choice
 
@@ -144,16 +144,21 @@ class TorchLearner(Learner):
     :param rule: what do I do?
     :param n_envs: number of environments
     :param form: which of the update's forms
+    :param one_step: whether λ is 0 throughout, and no trace has to be kept
     """
 
-    def __init__(self, perceiver: Perceiver, table: DenseTable, rule: ActionRule, n_envs: int, form: Form) -> None:
+    def __init__(
+        self, perceiver: Perceiver, table: DenseTable, rule: ActionRule, n_envs: int, form: Form, one_step: bool = False
+    ) -> None:
         self.perceiver = perceiver
         self.table = table
         self.rule = rule
         self.n_envs = n_envs
         self.form = form
         kind = "accumulating" if form.accumulating else "replacing"
-        self.traces = Traces(table, n_envs, kind, form.reset_other_actions)
+        self.traces: Traces = (
+            OneStepTraces(table, n_envs) if one_step else DenseTraces(table, n_envs, kind, form.reset_other_actions)
+        )
         shape, values = (n_envs, perceiver.search.n_neighbors), table.values
         self.indices = th.zeros(shape, dtype=th.int64, device=values.device)
         self.probabilities = values.new_zeros(shape)

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from sb3_knntd.memory.live import LiveStore
 from sb3_knntd.memory.table import DenseTable, HashedTable, QTable
-from sb3_knntd.memory.traces import Traces
+from sb3_knntd.memory.traces import DenseTraces, OneStepTraces, Traces
 
-__all__ = ["DenseTable", "HashedTable", "LiveStore", "QTable", "Traces"]
+__all__ = ["DenseTable", "DenseTraces", "HashedTable", "LiveStore", "OneStepTraces", "QTable", "Traces"]

@@ -1,0 +1,85 @@
+"""The torch step on an accelerator: 4096 environments against 10^6 points, and the bandwidth that it reaches."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from benchmarks.speed import Row
+from sb3_knntd.exploration import EpsilonGreedy
+from sb3_knntd.learner import Form, TorchLearner
+from sb3_knntd.policies import KNNPolicy
+from sb3_knntd.rules import DiscreteRule
+
+N_ENVS, POINTS, K = 4096, 1000, 16
+
+
+def bandwidth(work: Callable[[], Any], n_bytes: float, repeats: int) -> list[float]:
+    """
+    :param work: what is timed, on the device
+    :param n_bytes: bytes it has to move at least
+    :param repeats: how often
+    :return: bytes a second of each run
+    """
+    work()
+    rates = []
+    for _ in range(repeats):
+        start, end = (th.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        work()
+        end.record()
+        end.synchronize()
+        rates.append(n_bytes / (start.elapsed_time(end) / 1e3))
+    return rates
+
+
+def against_copy(repeats: int) -> list[Row]:
+    """
+    Bytes that perception (every distance written once and read once by the selection) and the update (rows read and
+    written) have to move, over their time, as a share of the bandwidth of a device-to-device copy.
+
+    :param repeats: how often each is run
+    :return: a row for each
+    """
+    device = th.device("cuda")
+    box = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    policy = KNNPolicy(box, spaces.Discrete(3), n_neighbors=K, points=POINTS, search="brute").to(device)
+    rule = DiscreteRule("sarsa", EpsilonGreedy(), True)
+    form = Form(0.99, True, False, False)
+    learner = TorchLearner(policy.perceiver, policy.table, rule, N_ENVS, form, one_step=True)  # type: ignore[arg-type]
+    rng = np.random.default_rng(0)
+    observations = rng.uniform(-1, 1, (N_ENVS, 2)).astype(np.float32)
+    learner.begin(observations, rng.random((N_ENVS, 2)), 0.1)
+    on_device = th.from_numpy(observations).to(device)
+
+    block = th.empty(2**28, dtype=th.float64, device=device)
+    other = th.empty_like(block)
+    copy = statistics.median(bandwidth(lambda: other.copy_(block), 2 * block.numel() * 8, repeats))
+
+    distances = 2 * N_ENVS * POINTS**2 * 8
+    rows = 3 * N_ENVS * K * 3 * 8
+    answers = rng.random(N_ENVS), np.zeros(N_ENVS, bool), [], np.empty(0), rng.random((N_ENVS, 2, 2)), (0.1, 0.0, 0.1)
+    reached = {
+        f"perception of {N_ENVS} observations among 10^6 points, device='cuda'": bandwidth(
+            lambda: policy.perceiver(on_device), distances, repeats
+        ),
+        f"a whole step of {N_ENVS} environments, device='cuda'": bandwidth(
+            lambda: learner.learn(observations, *answers), distances + rows, repeats
+        ),
+    }
+    return [
+        Row(
+            f"{what}: its bandwidth over that of a copy",
+            statistics.median(rates) / copy,
+            min(rates) / copy,
+            max(rates) / copy,
+            ">= 0",
+            f"{statistics.median(rates) / 1e9:.0f} / {copy / 1e9:.0f} GB/s on {th.cuda.get_device_name()}",
+        )
+        for what, rates in reached.items()
+    ]
