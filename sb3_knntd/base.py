@@ -21,15 +21,16 @@ from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, safe_mean
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, safe_mean
 
 from sb3_knntd.checks import check_number, check_schedule, check_word
 from sb3_knntd.compiled_learner import CompiledLearner
+from sb3_knntd.kernels.step import UNDRAWN
 from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, check_finite, check_transition
 from sb3_knntd.memory import DenseTable
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
-from sb3_knntd.rules import ActionRule, DiscreteRule
+from sb3_knntd.rules import ActionRule
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
@@ -51,6 +52,9 @@ class KNNAlgorithm(BaseAlgorithm):
     learner: Learner
     trace_schedule: Schedule
     exploration_schedule: Schedule
+    exploration_initial_eps: float
+    exploration_final_eps: float
+    exploration_fraction: float
 
     #: What an action space must be, and what to do with another.
     _supported_action_space: ClassVar[type[spaces.Space[Any]]]
@@ -124,6 +128,10 @@ class KNNAlgorithm(BaseAlgorithm):
     def _make_rule(self) -> ActionRule:
         """Check the parameters of the action rule and make it."""
 
+    def _policy_arguments(self) -> dict[str, Any]:
+        """Arguments of the policy besides those that all algorithms have."""
+        return {}
+
     @abstractmethod
     def _make_exploration_schedule(self) -> Schedule:
         """Check the parameters of exploration and make the schedule of its rate."""
@@ -188,7 +196,6 @@ class KNNAlgorithm(BaseAlgorithm):
         self.trace_schedule = FloatSchedule(self.trace_decay)
         self._trace_decay_is_constant = not callable(self.trace_decay)
         self.exploration_schedule = self._make_exploration_schedule()
-        rule = self._make_rule()
         normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
         if unknown:
@@ -207,8 +214,10 @@ class KNNAlgorithm(BaseAlgorithm):
             search=self.search,
             initial_value=self.initial_value,
             bounds_from_space=not normalizes,
+            **self._policy_arguments(),
             **self.policy_kwargs,
         ).to(self.device)
+        rule = self._make_rule()
         if self.verbose >= 1:
             print(
                 f"Neighbours by search={self.policy.search_name!r} over {self.policy.perceiver.points.n_points} points"
@@ -223,7 +232,6 @@ class KNNAlgorithm(BaseAlgorithm):
     def _make_learner(self, rule: ActionRule, form: Form) -> Learner:
         perceiver, table = self.policy.perceiver, self.policy.table
         if self.policy.is_compiled:
-            assert isinstance(rule, DiscreteRule)
             return CompiledLearner(perceiver, table, rule, self.n_envs, form)
         assert isinstance(table, DenseTable)
         return TorchLearner(perceiver, table, rule, self.n_envs, form, one_step=self.trace_decay == 0.0)
@@ -237,6 +245,12 @@ class KNNAlgorithm(BaseAlgorithm):
         check_word("tie_break", self.tie_break, ["random", "first"])
         if not isinstance(self.reset_other_actions, (bool, np.bool_)):
             raise ValueError(f"reset_other_actions must be True or False; got {self.reset_other_actions!r}")
+
+    def _make_epsilon_schedule(self) -> Schedule:
+        initial = check_number("exploration_initial_eps", self.exploration_initial_eps, 0.0, 1.0)
+        final = check_number("exploration_final_eps", self.exploration_final_eps, 0.0, 1.0)
+        fraction = check_number("exploration_fraction", self.exploration_fraction, 0.0, 1.0, above=True)
+        return LinearSchedule(initial, final, fraction)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -271,7 +285,10 @@ class KNNAlgorithm(BaseAlgorithm):
             return greedy, state
         rows, probabilities = self.policy.perceived_rows(np.asarray(observation))
         uniforms = th.from_numpy(np.stack([self._prediction_stream.next() for _ in range(len(rows))]))
-        choice = self._rule.choose(rows, probabilities, uniforms.to(rows.device), self.exploration_rate)
+        uniforms, rate = uniforms.to(rows.device), self.exploration_rate
+        nothing = th.full((len(rows), len(self._rule.blocks) - 1), UNDRAWN, device=rows.device)
+        held = self._rule.hold(nothing, uniforms, rate)
+        choice = self._rule.choose(rows, probabilities, uniforms, rate, held)
         return self._env_actions(choice.actions.cpu().numpy()).reshape(greedy.shape), state
 
     # --------------------------------------------------------------- learning

@@ -12,7 +12,7 @@ from sb3_knntd.kernels.desk import set_desk
 from sb3_knntd.learner import DIVERGENCE, Form, Learner, Rates, check_finite, check_transition
 from sb3_knntd.memory import LiveStore, QTable
 from sb3_knntd.perception import Perceiver
-from sb3_knntd.rules import DiscreteRule
+from sb3_knntd.rules import ActionRule
 
 FLOAT32 = np.dtype(np.float32)
 
@@ -28,7 +28,7 @@ class CompiledLearner(Learner):
     :param form: which of the update's forms
     """
 
-    def __init__(self, perceiver: Perceiver, table: QTable, rule: DiscreteRule, n_envs: int, form: Form) -> None:
+    def __init__(self, perceiver: Perceiver, table: QTable, rule: ActionRule, n_envs: int, form: Form) -> None:
         self.perceiver = perceiver
         self.table = table
         self.n_envs = n_envs
@@ -39,11 +39,24 @@ class CompiledLearner(Learner):
         self._most_new_points = n_envs * k
         self._indices = np.zeros((3, n_envs, k), np.int64)
         self._probabilities = np.zeros((3, n_envs, k))
-        actions = np.zeros((3, n_envs), np.int64)
-        self._actions: np.ndarray = actions[kernel.NOW]
+        n_blocks = len(rule.blocks) - 1
+        self._entries = np.zeros((3, n_envs, k, n_blocks), np.int64)
+        self._held = np.full((n_envs, n_blocks), kernel.UNDRAWN)
+        actions = np.zeros((3, n_envs, self._rule[-1].shape[1]))
+        # One action for all neighbours is the column that the first answers for.
+        averages = self._rule[0] == kernel.AVERAGE
+        self._actions: np.ndarray = self._entries[kernel.NOW, :, 0, 0] if averages else actions[kernel.NOW]
         self._truncated = np.zeros(n_envs, np.bool_)
         self._last_observations = np.zeros((n_envs, obs_dim))
-        self._episodes = self._indices, self._probabilities, actions, self._truncated, self._last_observations
+        self._episodes = (
+            self._indices,
+            self._probabilities,
+            self._entries,
+            actions,
+            self._truncated,
+            self._last_observations,
+            self._held,
+        )
         self._sums = np.zeros(2)
         self._n_sums = 0
         corrections, places = np.zeros(n_envs), np.zeros((n_envs, k), np.int64)
@@ -115,11 +128,11 @@ class CompiledLearner(Learner):
         return {"td_error": td_error, "q_mean": q_mean}
 
     def state_dict(self) -> dict[str, Any]:
-        indices = th.from_numpy(self._indices[kernel.NOW].copy())
         return {
-            "indices": indices,
+            "indices": th.from_numpy(self._indices[kernel.NOW].copy()),
             "probabilities": th.from_numpy(self._probabilities[kernel.NOW].copy()),
-            "entries": th.from_numpy(self._actions.copy())[:, None].expand(indices.shape).contiguous(),
+            "entries": th.from_numpy(self._entries[kernel.NOW].copy()),
+            "held": th.from_numpy(self._held.copy()),
             "traces": self.live.state(),
         }
 
@@ -128,7 +141,8 @@ class CompiledLearner(Learner):
         if len(state_dict["indices"]) == self.n_envs:
             self._indices[kernel.NOW] = state_dict["indices"].numpy()
             self._probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
-            self._actions[:] = state_dict["entries"][:, 0].numpy()
+            self._entries[kernel.NOW] = state_dict["entries"].numpy()
+            self._held[:] = state_dict["held"].numpy()
             self.live.set_state(state_dict["traces"])
         self._set_desk()
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_number, check_schedule, check_word
+from sb3_knntd.checks import check_schedule, check_word
 from sb3_knntd.exploration import EXPLORATIONS
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.rules import ActionRule, DiscreteRule
@@ -154,17 +154,15 @@ class KNNTD(KNNAlgorithm):
 
     def _make_rule(self) -> ActionRule:
         check_word("target", self.target, ["sarsa", "q_learning", "expected_sarsa"])
-        return DiscreteRule(self.target, EXPLORATIONS[self.exploration](), self.tie_break == "random")
+        return DiscreteRule(
+            self.policy.table.n_actions, self.target, EXPLORATIONS[self.exploration](), self.tie_break == "random"
+        )
 
     def _make_exploration_schedule(self) -> Schedule:
         check_word("exploration", self.exploration, EXPLORATIONS)
-        initial = check_number("exploration_initial_eps", self.exploration_initial_eps, 0.0, 1.0)
-        final = check_number("exploration_final_eps", self.exploration_final_eps, 0.0, 1.0)
-        fraction = check_number("exploration_fraction", self.exploration_fraction, 0.0, 1.0, above=True)
+        epsilon = self._make_epsilon_schedule()
         self.temperature = check_schedule("temperature", self.temperature, 0.0, above=True)
-        if self.exploration == "softmax":
-            return FloatSchedule(self.temperature)
-        return LinearSchedule(initial, final, fraction)
+        return FloatSchedule(self.temperature) if self.exploration == "softmax" else epsilon
 
     def _env_actions(self, actions: np.ndarray) -> np.ndarray:
         assert isinstance(self.action_space, spaces.Discrete)

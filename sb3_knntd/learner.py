@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_knntd.kernels.step import UNDRAWN
 from sb3_knntd.memory import DenseTable, DenseTraces, OneStepTraces, Traces
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.rules import ActionRule, Choice
@@ -49,7 +50,8 @@ class Learner(ABC):
         :param observations: shape (n_envs, *obs_shape)
         :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
         :param rate: ε or the temperature
-        :return: index of the action to take in each environment, shape (n_envs,), int64
+        :return: the action to take in each environment: its index, shape (n_envs,), int64, or a vector, shape
+            (n_envs, action_dim)
         :raises ValueError: if an observation is not finite
         """
 
@@ -76,7 +78,8 @@ class Learner(ABC):
         :param uniforms: random numbers in [0, 1), shape (n_envs, 2, n_uniforms): for the next action, and for
             the one that would have been taken at a truncation
         :param rates: the scheduled parameters
-        :return: index of the action to take in each environment, shape (n_envs,), int64
+        :return: the action to take in each environment: its index, shape (n_envs,), int64, or a vector, shape
+            (n_envs, action_dim)
         :raises ValueError: if an observation or reward is not finite; nothing has been changed then
         :raises FloatingPointError: if the values have diverged; nothing has been changed then
         """
@@ -162,14 +165,18 @@ class TorchLearner(Learner):
         shape, values = (n_envs, perceiver.search.n_neighbors), table.values
         self.indices = th.zeros(shape, dtype=th.int64, device=values.device)
         self.probabilities = values.new_zeros(shape)
-        self.entries = th.zeros(shape, dtype=th.int64, device=values.device)
+        n_blocks = len(rule.blocks) - 1
+        self.entries = th.zeros((*shape, n_blocks), dtype=th.int64, device=values.device)
+        #: what each environment is exploring, see :meth:`~sb3_knntd.rules.ActionRule.hold`
+        self.held = th.full((n_envs, n_blocks), UNDRAWN, dtype=th.int64, device=values.device)
         self._sums = values.new_zeros(2)
         self._n_sums = 0
 
     def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
         check_finite("an observation", observations, range(self.n_envs))
         self.traces.clear()
-        perception, choice = self._choose(observations, uniforms, rate)
+        self._hold(UNDRAWN, uniforms, rate)
+        perception, choice = self._choose(observations, uniforms, rate, self.held)
         return self._settle_in(perception, choice)
 
     def learn(
@@ -183,10 +190,12 @@ class TorchLearner(Learner):
         rates: Rates,
     ) -> np.ndarray:
         check_transition(observations, rewards)
-        perception, choice = self._choose(observations, uniforms[:, 0], rates[2])
+        held, over = self.held, self._tensor(ended)
+        self._hold(th.where(over[:, None], UNDRAWN, held), uniforms[:, 0], rates[2])
+        perception, choice = self._choose(observations, uniforms[:, 0], rates[2], self.held)
         worth = choice.values * self._tensor(~ended)
         if truncated:
-            _, last = self._choose(last_observations, uniforms[truncated, 1], rates[2])
+            _, last = self._choose(last_observations, uniforms[truncated, 1], rates[2], held[truncated])
             worth[truncated] = last.values
 
         value = self._value()
@@ -200,7 +209,7 @@ class TorchLearner(Learner):
 
         self.traces.mark(self.indices, self.entries, self.probabilities)
         self.traces.credit(corrections)
-        self.traces.decay(self.form.gamma * rates[1], self._tensor(ended))
+        self.traces.decay(self.form.gamma * rates[1], over)
         self.table.visited[self.indices] = True
         self._sums += th.stack((errors.abs().sum(), value.sum()))
         self._n_sums += self.n_envs
@@ -219,6 +228,7 @@ class TorchLearner(Learner):
             "indices": self.indices.cpu(),
             "probabilities": self.probabilities.double().cpu(),
             "entries": self.entries.cpu(),
+            "held": self.held.cpu(),
             "traces": self.traces.state(),
         }
 
@@ -226,20 +236,26 @@ class TorchLearner(Learner):
         self.traces.clear()
         if len(state_dict["indices"]) != self.n_envs:
             return
-        for name in ("indices", "probabilities", "entries"):
+        for name in ("indices", "probabilities", "entries", "held"):
             getattr(self, name).copy_(state_dict[name])
         self.traces.set_state(state_dict["traces"])
 
-    def _choose(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> tuple[Perception, Choice]:
+    def _hold(self, held: th.Tensor | int, uniforms: np.ndarray, rate: float) -> None:
+        start = held if isinstance(held, th.Tensor) else th.full_like(self.held, held)
+        self.held = self.rule.hold(start, self._tensor(uniforms), rate)
+
+    def _choose(
+        self, observations: np.ndarray, uniforms: np.ndarray, rate: float, held: th.Tensor
+    ) -> tuple[Perception, Choice]:
         perception = self.perceiver(self._tensor(observations))
         probabilities = perception.probabilities.to(self.table.values.dtype)
         rows = self.table.rows(perception.indices)
-        choice = self.rule.choose(rows, probabilities, self._tensor(uniforms), rate)
+        choice = self.rule.choose(rows, probabilities, self._tensor(uniforms), rate, held)
         return Perception(perception.indices, probabilities), choice
 
     def _value(self) -> th.Tensor:
         """Q(s, a) at the state and action that each environment is leaving, shape (n_envs,)."""
-        taken = self.table.rows(self.indices).gather(2, self.entries[..., None])[..., 0]
+        taken = self.table.rows(self.indices).gather(2, self.entries).mean(dim=2)
         return (self.probabilities * taken).sum(dim=1)
 
     def _settle_in(self, perception: Perception, choice: Choice) -> np.ndarray:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any
+from itertools import pairwise
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -12,16 +13,16 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
+from sb3_knntd.actions import ActionColumns, make_action_columns
 from sb3_knntd.checks import check_integer, check_number, check_word
 from sb3_knntd.exploration import greedy
 from sb3_knntd.kernels import jit
-from sb3_knntd.kernels.perceive import FOUND
-from sb3_knntd.kernels.step import best_actions
+from sb3_knntd.kernels.step import best_entries
 from sb3_knntd.memory import DenseTable, HashedTable, QTable
 from sb3_knntd.perception import Lattice, Perceiver, Perception, Points, make_bounds, make_points, make_weights
 from sb3_knntd.perception.search import SEARCHES, make_search
 from sb3_knntd.perception.weights import KernelWeights
-from sb3_knntd.rules import mean_rows
+from sb3_knntd.rules import mean_actions, mean_rows
 
 #: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
 DENSE_TABLE_BYTES = 2**28
@@ -48,9 +49,13 @@ class KNNPolicy(BasePolicy):
         larger than memory, on the CPU), or ``"auto"``: dense up to 256 MiB
     :param compiled: whether to use the compiled step where it can be used: on the CPU, with numba, and with
         weights that are no function
+    :param columns: what each column of the table stands for; by default one of the Discrete actions
     :param bounds_from_space: whether the observation space tells the range of the observations
     :raises ValueError: if an argument does not fit; the message says which, and what would
     """
+
+    #: whether one action is chosen from the average of the neighbours' rows
+    _AVERAGES: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -68,6 +73,7 @@ class KNNPolicy(BasePolicy):
         table: str = "auto",
         compiled: bool = True,
         bounds_from_space: bool = True,
+        columns: ActionColumns | None = None,
     ) -> None:
         super().__init__(observation_space, action_space)
         check_number("initial_value", initial_value)
@@ -99,7 +105,13 @@ class KNNPolicy(BasePolicy):
             warnings.warn(
                 f"numba cannot be used ({jit.REASON}): learning goes by torch operations, slower", stacklevel=2
             )
-        self.table = self._make_table(table, places, self._count_actions(), initial_value, dtype)
+        if columns is None:
+            assert isinstance(action_space, spaces.Discrete)
+            n_actions = int(action_space.n)
+            columns = ActionColumns(np.empty((n_actions, 0)), np.array([0, n_actions]), [])
+        #: what each column of the table stands for
+        self.columns = columns
+        self.table = self._make_table(table, places, int(columns.blocks[-1]), initial_value, dtype)
 
     def _make_table(self, table: str, places: Points, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
         check_word("policy_kwargs: table", table, ["auto", "dense", "hashed"])
@@ -119,10 +131,6 @@ class KNNPolicy(BasePolicy):
     def is_compiled(self) -> bool:
         """Whether the compiled step is used."""
         return self._compilable and self.device.type == "cpu"
-
-    def _count_actions(self) -> int:
-        assert isinstance(self.action_space, spaces.Discrete)
-        return int(self.action_space.n)
 
     @property
     def device(self) -> th.device:
@@ -191,31 +199,40 @@ class KNNPolicy(BasePolicy):
         :return: action, or a batch of them, and ``state``
         """
         shape = self.observation_space.shape or ()
-        if not self.is_compiled or not isinstance(observation, np.ndarray):
-            return super().predict(observation, state, episode_start, deterministic)
-        batch = observation.shape[: observation.ndim - len(shape)]
-        if len(batch) > 1 or (*batch, *shape) != observation.shape:
-            return super().predict(observation, state, episode_start, deterministic)
-        return self._best_actions(observation.reshape(-1, self.perceiver.bounds.obs_dim)).reshape(batch), state
+        array = observation if isinstance(observation, np.ndarray) else np.empty((0,) * (len(shape) + 2))
+        batch = array.shape[: array.ndim - len(shape)]
+        if not self.is_compiled or len(batch) > 1 or (*batch, *shape) != array.shape:
+            actions, state = super().predict(observation, state, episode_start, deterministic)
+            return actions.astype(self.action_space.dtype), state
+        entries, probabilities = self._best_entries(array.reshape(-1, self.perceiver.bounds.obs_dim))
+        actions = self._recommended(entries, probabilities)
+        return actions.reshape((*batch, *(self.action_space.shape or ()))), state
 
-    def _best_actions(self, observations: np.ndarray) -> np.ndarray:
-        assert isinstance(self.action_space, spaces.Discrete)
+    def _best_entries(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The columns that the neighbours recommend, (batch, k, n_blocks), and how much each counts, (batch, k)."""
         if not np.isfinite(observations).all():
             raise ValueError(f"observation must be finite; got {observations.tolist()}")
         n, k = len(observations), self.n_neighbors
         eyes = self.perceiver.eyes
         assert eyes is not None
-        if eyes[3] == FOUND:
+        if self.perceiver.search_is_outside:
             neighbors = self.perceiver.find(th.from_numpy(observations))
             indices, probabilities = neighbors.indices.numpy(), neighbors.squared_distances.numpy()
         else:
             indices, probabilities = np.empty((n, k), np.int64), np.empty((n, k))
-        actions = np.empty(n, np.int64)
         self.table.sync()
         values, _, _, row_slots, initial = self.table.arrays()
         seen = observations.astype(np.float64)
-        best_actions(seen, eyes, indices, probabilities, values, row_slots, initial, actions)
-        return actions + int(self.action_space.start)
+        blocks = self.columns.blocks
+        entries = np.empty((n, k, len(blocks) - 1), np.int64)
+        best_entries(seen, eyes, indices, probabilities, values, row_slots, initial, blocks, self._AVERAGES, entries)
+        return entries, probabilities
+
+    def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+        """Actions of the environment, (batch, *action_shape), from what the neighbours recommend."""
+        assert isinstance(self.action_space, spaces.Discrete)
+        actions: np.ndarray = entries[:, 0, 0] + self.action_space.start
+        return actions
 
     def forward(self, observation: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
@@ -263,6 +280,62 @@ class KNNPolicy(BasePolicy):
             "action_space": self.action_space,
             **self._arguments,
         }
+
+
+class ExAPolicy(KNNPolicy):
+    """
+    A table of the values of action points, of which each neighbour recommends its best, and the mean is taken.
+
+    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param action_space: Box with finite bounds
+    :param lr_schedule: not used
+    :param action_points: see :class:`~sb3_knntd.ExA`
+    :param action_table: see :class:`~sb3_knntd.ExA`
+    :param arguments: the others of :class:`KNNPolicy`
+    :raises ValueError: if an argument does not fit; the message says which, and what would
+    """
+
+    _AVERAGES: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Schedule | None = None,
+        action_points: Any = 3,
+        action_table: str | None = None,
+        **arguments: Any,
+    ) -> None:
+        assert isinstance(action_space, spaces.Box)
+        columns = make_action_columns(action_space, action_points, action_table)
+        super().__init__(observation_space, action_space, lr_schedule, columns=columns, **arguments)
+        self._arguments |= {"action_points": action_points, "action_table": action_table}
+
+    @property
+    def action_points(self) -> list[th.Tensor]:
+        """The action points of each dimension, action units."""
+        return [th.from_numpy(points) for points in self.columns.lists]
+
+    def fit_actions(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: shape (batch, action_dim), action units
+        :return: the same as the environment takes them: in its shape and type, rounding kept within its bounds
+        """
+        space = self.action_space
+        assert isinstance(space, spaces.Box)
+        fitting: np.ndarray = np.clip(actions.reshape(-1, *space.shape).astype(space.dtype), space.low, space.high)
+        return fitting
+
+    def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+        return self.fit_actions((probabilities[..., None] * self.columns.points[entries].sum(axis=2)).sum(axis=1))
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        rows, probabilities = self._rows(observation)
+        blocks = self.columns.blocks.tolist()
+        entries = [first + greedy(rows[..., first:end]) for first, end in pairwise(blocks)]
+        points = th.from_numpy(self.columns.points).to(probabilities)
+        return mean_actions(th.stack(entries, dim=2), probabilities, points)
 
 
 def _count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:

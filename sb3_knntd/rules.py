@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from itertools import pairwise
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 
-from sb3_knntd.exploration import Exploration, Softmax, greedy
-from sb3_knntd.kernels.step import EPSILON_GREEDY, EXPECTED_SARSA, Q_LEARNING, SARSA, SOFTMAX
+from sb3_knntd.exploration import Exploration, Softmax, greedy, pick
+from sb3_knntd.kernels.step import (
+    AVERAGE,
+    EACH,
+    EPSILON_GREEDY,
+    EXPECTED_SARSA,
+    GREEDY,
+    PER_NEIGHBOR,
+    Q_LEARNING,
+    SARSA,
+    SHARED,
+    SOFTMAX,
+    UNDRAWN,
+)
 
 
 class Choice(NamedTuple):
     """
     An action for each row, with what learning needs to know of it.
 
-    :param actions: index of the action, shape (batch,), int64
-    :param entries: the column of the table that each neighbour answers for, shape (batch, k), int64
+    :param actions: the action: its index, shape (batch,), int64, or a vector, shape (batch, action_dim)
+    :param entries: the columns of the table that each neighbour answers for, one for each of the action's parts,
+        shape (batch, k, n_blocks), int64
     :param values: what the state is worth as a target, shape (batch,), the table's dtype
     """
 
@@ -24,13 +40,29 @@ class Choice(NamedTuple):
     values: th.Tensor
 
 
-class ActionRule(Protocol):
+class ActionRule(ABC):
     """Chooses from the rows of the neighbours."""
 
     #: uniform random numbers a choice takes
     n_uniforms: int
+    #: where the columns of each of the action's parts begin, and the end, shape (n_blocks + 1,), int64
+    blocks: np.ndarray
 
-    def choose(self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float) -> Choice:
+    @abstractmethod
+    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float) -> th.Tensor:
+        """
+        What is being explored, now that a step has passed.
+
+        :param held: the columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (batch, n_blocks), int64
+        :param uniforms: random numbers in [0, 1), shape (batch, n_uniforms)
+        :param rate: ε or the temperature
+        :return: the same, shape (batch, n_blocks)
+        """
+
+    @abstractmethod
+    def choose(
+        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, held: th.Tensor
+    ) -> Choice:
         """
         The action to take while training.
 
@@ -38,17 +70,14 @@ class ActionRule(Protocol):
         :param probabilities: of the neighbours, shape (batch, k), the table's dtype
         :param uniforms: random numbers in [0, 1), shape (batch, n_uniforms)
         :param rate: ε or the temperature
+        :param held: see :meth:`hold`
         """
-        ...
 
-    def best(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+    @abstractmethod
+    def kernel_arguments(self) -> tuple[Any, ...]:
         """
-        The action to take without exploring, ties to the lowest index.
-
-        :param rows: table rows of the neighbours, shape (batch, k, n_actions)
-        :param probabilities: of the neighbours, shape (batch, k), the table's dtype
+        :return: ``RULE`` of :mod:`sb3_knntd.kernels.desk`
         """
-        ...
 
 
 def mean_rows(rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
@@ -62,31 +91,47 @@ def mean_rows(rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
     return (probabilities[..., None] * rows).sum(dim=1)
 
 
-class DiscreteRule:
+def mean_actions(entries: th.Tensor, probabilities: th.Tensor, action_points: th.Tensor) -> th.Tensor:
+    """
+    The mean of what the neighbours recommend (eq. 21).
+
+    :param entries: the columns they recommend, shape (batch, k, n_blocks)
+    :param probabilities: of the neighbours, shape (batch, k)
+    :param action_points: the action of each column, shape (n_actions, action_dim)
+    :return: shape (batch, action_dim)
+    """
+    return (probabilities[..., None] * action_points[entries].sum(dim=2)).sum(dim=1)
+
+
+class DiscreteRule(ActionRule):
     """
     kNN-TD's rule: the neighbours' values are averaged, and one action is chosen from the average
     (eqs. 8 to 12).
 
+    :param n_actions: number of actions
     :param target: ``"sarsa"`` (eq. 11), ``"q_learning"`` (eq. 12) or ``"expected_sarsa"``
     :param exploration: the policy while training
     :param random_ties: whether equal best actions are drawn from while training
     """
 
-    def __init__(self, target: str, exploration: Exploration, random_ties: bool) -> None:
+    def __init__(self, n_actions: int, target: str, exploration: Exploration, random_ties: bool) -> None:
         self.target = target
         self.exploration = exploration
         self.random_ties = random_ties
         self.n_uniforms = exploration.N_UNIFORMS
+        self.blocks = np.array([0, n_actions])
 
-    def kernel_arguments(self) -> tuple[int, int, bool]:
-        """
-        :return: ``rule`` of :func:`sb3_knntd.kernels.step.choose`
-        """
+    def kernel_arguments(self) -> tuple[Any, ...]:
         target = {"sarsa": SARSA, "q_learning": Q_LEARNING, "expected_sarsa": EXPECTED_SARSA}[self.target]
         exploration = SOFTMAX if isinstance(self.exploration, Softmax) else EPSILON_GREEDY
-        return target, exploration, self.random_ties
+        return AVERAGE, target, exploration, self.random_ties, 1.0, self.blocks, np.empty((0, 0))
 
-    def choose(self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float) -> Choice:
+    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float) -> th.Tensor:
+        return held
+
+    def choose(
+        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, held: th.Tensor
+    ) -> Choice:
         values = mean_rows(rows, probabilities)
         actions = self.exploration.choose(values, uniforms, rate, self.random_ties)
         if self.target == "sarsa":
@@ -95,7 +140,73 @@ class DiscreteRule:
             worth = values.amax(dim=1)
         else:
             worth = self.exploration.expectation(values, rate)
-        return Choice(actions, actions[:, None].expand(probabilities.shape), worth)
+        return Choice(actions, actions[:, None, None].expand(*probabilities.shape, 1), worth)
 
-    def best(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
-        return greedy(mean_rows(rows, probabilities))
+
+class ContinuousRule(ActionRule):
+    """
+    Ex⟨a⟩'s rule: each neighbour recommends the best action of its own row, and the recommendations are averaged
+    (eqs. 19 to 21). What the state is worth is the mean of the neighbours' best values (eq. 25).
+
+    :param action_points: the action of each column, shape (n_actions, action_dim), action units
+    :param blocks: where the columns of each of the action's parts begin, and the end, shape (n_blocks + 1,)
+    :param shared: whether all neighbours explore the same column together, or each by itself (eq. 27)
+    :param mean_hold: for how many steps in the mean a draw of whether and what to explore together is held
+    :param n_neighbors: k
+    :param random_ties: whether equal best columns are drawn from while training
+    """
+
+    def __init__(
+        self,
+        action_points: np.ndarray,
+        blocks: np.ndarray,
+        shared: bool,
+        mean_hold: float,
+        n_neighbors: int,
+        random_ties: bool,
+    ) -> None:
+        self.action_points = action_points
+        self.blocks = blocks
+        self.shared = shared
+        self.mean_hold = mean_hold
+        self.random_ties = random_ties
+        n_blocks = len(blocks) - 1
+        #: redraw, explore, column of each block, tie of each neighbour and block, and whether each explores
+        self._parts = [1, 1, n_blocks, n_neighbors * n_blocks, 0 if shared else n_neighbors * n_blocks]
+        self.n_uniforms = sum(self._parts)
+
+    def kernel_arguments(self) -> tuple[Any, ...]:
+        exploration = SHARED if self.shared else PER_NEIGHBOR
+        return EACH, SARSA, exploration, self.random_ties, self.mean_hold, self.blocks, self.action_points
+
+    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float) -> th.Tensor:
+        if not self.shared:
+            return held
+        redraw, explore, columns, *_ = uniforms.split(self._parts, dim=1)
+        drawn = [
+            first + pick(columns[:, block], end - first)
+            for block, (first, end) in enumerate(pairwise(self.blocks.tolist()))
+        ]
+        fresh = th.where(explore < rate, th.stack(drawn, dim=1), GREEDY)
+        return th.where((held[:, :1] == UNDRAWN) | (redraw * self.mean_hold < 1.0), fresh, held)
+
+    def choose(
+        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, held: th.Tensor
+    ) -> Choice:
+        batch, k, _ = rows.shape
+        _, _, _, ties, explore = uniforms.split(self._parts, dim=1)
+        ties = ties.reshape(batch, k, -1)
+        entries, worth = [], probabilities.new_zeros(batch)
+        for block, (first, end) in enumerate(pairwise(self.blocks.tolist())):
+            part = rows[..., first:end]
+            entry = first + greedy(part, ties[..., block] if self.random_ties else None)
+            worth = worth + (probabilities * part.amax(dim=-1)).sum(dim=1)
+            if self.shared:
+                entry = th.where(held[:, block, None] >= 0, held[:, block, None], entry)
+            else:
+                drawn = first + pick(ties[..., block], end - first)
+                entry = th.where(explore.reshape(batch, k, -1)[..., block] < rate, drawn, entry)
+            entries.append(entry)
+        chosen = th.stack(entries, dim=2)
+        points = th.from_numpy(self.action_points).to(probabilities)
+        return Choice(mean_actions(chosen, probabilities, points), chosen, worth / len(entries))

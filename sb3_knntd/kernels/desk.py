@@ -4,11 +4,15 @@ fast as one array.
 
 perception     ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`: low, width, limit, search, axes, offsets,
                columns, weights, bandwidth
-choice         target, exploration, random_ties of :func:`sb3_knntd.kernels.step.choose`
+choice         rule: ``AVERAGE`` or ``EACH``; target, exploration, random_ties of
+               :func:`sb3_knntd.kernels.step.choose`, and how long an exploring action is held; blocks (n_blocks + 1,):
+               where the columns of each of the action's parts begin; action_points (n_actions, action_dim)
 update         gamma, normalized (step), accumulating (traces), reset_others
-episodes       indices, probabilities (3, n_envs, k) and actions (3, n_envs): of the state that each environment left,
-               ``NOW``, of the one it is in, ``THEN``, and of the ``LAST`` one before a truncation; truncated (n_envs,)
-               and last_observations (n_envs, obs_dim): which episodes were, and what was seen last
+episodes       indices, probabilities (3, n_envs, k), entries (3, n_envs, k, n_blocks), the columns that each neighbour
+               answers for, and actions (3, n_envs, action_dim): of the state that each environment left, ``NOW``, of
+               the one it is in, ``THEN``, and of the ``LAST`` one before a truncation; truncated (n_envs,) and
+               last_observations (n_envs, obs_dim): which episodes were, and what was seen last; held (n_envs,
+               n_blocks): the column that is being explored, ``GREEDY`` or ``UNDRAWN``
 memory         the arrays of :mod:`sb3_knntd.kernels.memory`
 log            sums of the TD errors' sizes and of the values, (2,)
 work           values (2, n_actions), corrections (n_envs,), places (n_envs, k), to be used
@@ -21,9 +25,9 @@ from collections import namedtuple
 from sb3_knntd.kernels.jit import AVAILABLE, jit
 
 EYES = ("low", "width", "limit", "search", "axes", "offsets", "columns", "weights", "bandwidth")
-RULE = ("target", "exploration", "random_ties")
+RULE = ("rule", "target", "exploration", "random_ties", "hold", "blocks", "action_points")
 FORM = ("gamma", "normalized", "accumulating", "reset_others")
-EPISODES = ("indices", "probabilities", "actions", "truncated", "last_observations")
+EPISODES = ("indices", "probabilities", "entries", "actions", "truncated", "last_observations", "held")
 MEMORY = (
     "values",
     "visited",
@@ -63,12 +67,12 @@ else:
 
 
 @jit
-def set_desk(eyes, rule, form, episodes, memory, work):
+def set_desk(eyes, choice, form, episodes, memory, work):
     """A desk of the fields named above; compiled, as that is what numba keeps on disk."""
     low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
-    target, exploration, random_ties = rule
+    rule, target, exploration, random_ties, hold, blocks, action_points = choice
     gamma, normalized, accumulating, reset_others = form
-    indices, probabilities, actions, truncated, last_observations = episodes
+    indices, probabilities, entries, actions, truncated, last_observations, held = episodes
     values, visited, row_points, row_slots, initial, live_points, live, live_slots, counts, pace = memory
     sums, means, corrections, places = work
     return Desk(
@@ -81,18 +85,24 @@ def set_desk(eyes, rule, form, episodes, memory, work):
         columns,
         weights,
         bandwidth,
+        rule,
         target,
         exploration,
         random_ties,
+        hold,
+        blocks,
+        action_points,
         gamma,
         normalized,
         accumulating,
         reset_others,
         indices,
         probabilities,
+        entries,
         actions,
         truncated,
         last_observations,
+        held,
         values,
         visited,
         row_points,

@@ -94,29 +94,22 @@ def total(live, place, action, pace):
 
 
 @jit
-def add_rows(indices, probabilities, values, row_slots, initial, live, live_slots, pace, means):
-    """Write Q(s, ·) = Σ p(i) Q(i, ·) into ``means``, shape (n_actions,)."""
-    n_actions = len(means)
-    means[:] = 0.0
-    for i in range(len(indices)):
-        place = find(indices[i], live_slots)
-        if place >= 0:
-            for action in range(n_actions):
-                means[action] += probabilities[i] * total(live, place, action, pace)
-            continue
-        row = row_of(indices[i], row_slots)
-        for action in range(n_actions):
-            means[action] += probabilities[i] * (values[row, action] if row >= 0 else initial)
+def read_row(point, values, row_slots, initial, live, live_slots, pace, row):
+    """Write the values of a point's actions into ``row``, shape (n_actions,)."""
+    place = find(point, live_slots)
+    if place >= 0:
+        for action in range(len(row)):
+            row[action] = total(live, place, action, pace)
+    else:
+        read_stored_row(point, values, row_slots, initial, row)
 
 
 @jit
-def add_stored_rows(indices, probabilities, values, row_slots, initial, means):
-    """As :func:`add_rows`, from the table alone."""
-    means[:] = 0.0
-    for i in range(len(indices)):
-        row = row_of(indices[i], row_slots)
-        for action in range(len(means)):
-            means[action] += probabilities[i] * (values[row, action] if row >= 0 else initial)
+def read_stored_row(point, values, row_slots, initial, row):
+    """As :func:`read_row`, from the table alone."""
+    place = row_of(point, row_slots)
+    for action in range(len(row)):
+        row[action] = values[place, action] if place >= 0 else initial
 
 
 @jit

@@ -7,10 +7,10 @@ import numpy as np
 from sb3_knntd.kernels.jit import jit
 from sb3_knntd.kernels.memory import (
     LEAST_CLOCK,
-    add_rows,
-    add_stored_rows,
     end_episode,
     enliven,
+    read_row,
+    read_stored_row,
     set_trace,
     settle,
     total,
@@ -18,7 +18,12 @@ from sb3_knntd.kernels.memory import (
 from sb3_knntd.kernels.perceive import perceive
 
 SARSA, Q_LEARNING, EXPECTED_SARSA = 0, 1, 2
-EPSILON_GREEDY, SOFTMAX = 0, 1
+EPSILON_GREEDY, SOFTMAX, PER_NEIGHBOR, SHARED = 0, 1, 2, 3
+
+#: What is made of the neighbours' rows: one action from their average, or an action each, which are averaged.
+AVERAGE, EACH = 0, 1
+#: No column is being explored, or none has been drawn in this episode.
+GREEDY, UNDRAWN = -1, -2
 
 #: Which state's arrays.
 NOW, THEN, LAST = 0, 1, 2
@@ -33,26 +38,26 @@ def pick(uniform, n):
 
 
 @jit
-def best_action(values):
-    """The first of the best actions."""
-    best = 0
-    for action in range(1, len(values)):
+def best_action(values, first, end):
+    """The first of the best actions from ``first`` to before ``end``."""
+    best = first
+    for action in range(first + 1, end):
         if values[action] > values[best]:
             best = action
     return best
 
 
 @jit
-def greedy_action(values, uniform, random_ties):
-    """The best action, drawn from equals or the first of them."""
-    best = best_action(values)
+def greedy_action(values, first, end, uniform, random_ties):
+    """The best action from ``first`` to before ``end``, drawn from equals or the first of them."""
+    best = best_action(values, first, end)
     if not random_ties:
         return best
     ties = 0
-    for action in range(len(values)):
+    for action in range(first, end):
         ties += values[action] == values[best]
     rank = pick(uniform, ties)
-    for action in range(len(values)):
+    for action in range(first, end):
         if values[action] == values[best]:
             if rank == 0:
                 return action
@@ -62,7 +67,7 @@ def greedy_action(values, uniform, random_ties):
 
 @jit
 def _softmax(values, temperature, shares):
-    largest, total = values[best_action(values)], 0.0
+    largest, total = values[best_action(values, 0, len(values))], 0.0
     for action in range(len(values)):
         shares[action] = np.exp((values[action] - largest) / temperature)
         total += shares[action]
@@ -85,7 +90,7 @@ def choose(values, uniforms, rate, target, exploration, random_ties, shares):
     """
     n_actions = len(values)
     if exploration == EPSILON_GREEDY:
-        action = greedy_action(values, uniforms[1], random_ties)
+        action = greedy_action(values, 0, n_actions, uniforms[1], random_ties)
         if uniforms[0] < rate:
             action = pick(uniforms[1], n_actions)
     else:
@@ -100,7 +105,7 @@ def choose(values, uniforms, rate, target, exploration, random_ties, shares):
 
     if target == SARSA:
         return action, values[action]
-    largest = values[best_action(values)]
+    largest = values[best_action(values, 0, n_actions)]
     if target == Q_LEARNING:
         return action, largest
     worth = 0.0
@@ -111,6 +116,69 @@ def choose(values, uniforms, rate, target, exploration, random_ties, shares):
     for candidate in range(n_actions):
         worth += shares[candidate] * values[candidate]
     return action, worth
+
+
+@jit
+def choose_average(uniforms, rate, state, env, desk):
+    """One action from the average of the neighbours' rows. The arguments are those of :func:`perceive_and_choose`."""
+    indices, probabilities, entries = desk.indices[state, env], desk.probabilities[state, env], desk.entries[state, env]
+    means, row = desk.means[0], desk.means[1]
+    means[:] = 0.0
+    for i in range(len(indices)):
+        read_row(indices[i], desk.values, desk.row_slots, desk.initial, desk.live, desk.live_slots, desk.pace, row)
+        for action in range(len(means)):
+            means[action] += probabilities[i] * row[action]
+    action, worth = choose(means, uniforms, rate, desk.target, desk.exploration, desk.random_ties, row)
+    for i in range(len(indices)):
+        entries[i, 0] = action
+    return worth
+
+
+@jit
+def hold(uniforms, rate, env, desk):
+    """
+    Go on with what is being explored, or draw anew whether to explore and what: the draw is held for
+    ``desk.hold`` steps in the mean.
+
+    :param uniforms: random numbers in [0, 1), of which the first 2 + n_blocks are used
+    :param rate: ε, the share of draws that explore
+    :param env: which environment
+    :param desk: see :mod:`sb3_knntd.kernels.desk`
+    """
+    held = desk.held[env]
+    if held[0] == UNDRAWN or uniforms[0] * desk.hold < 1.0:
+        for block in range(len(held)):
+            first, end = desk.blocks[block], desk.blocks[block + 1]
+            held[block] = first + pick(uniforms[2 + block], end - first) if uniforms[1] < rate else GREEDY
+
+
+@jit
+def choose_each(uniforms, rate, state, env, desk):
+    """
+    An action from each neighbour's row, and their average (eqs. 19 to 21, 25 and 27). The arguments are those of
+    :func:`perceive_and_choose`.
+    """
+    indices, probabilities, entries = desk.indices[state, env], desk.probabilities[state, env], desk.entries[state, env]
+    held, blocks, row, actions = desk.held[env], desk.blocks, desk.means[0], desk.actions[state, env]
+    k, n_blocks = entries.shape
+    actions[:] = 0.0
+    worth = 0.0
+    for i in range(k):
+        read_row(indices[i], desk.values, desk.row_slots, desk.initial, desk.live, desk.live_slots, desk.pace, row)
+        for block in range(n_blocks):
+            first, end = blocks[block], blocks[block + 1]
+            uniform = uniforms[2 + n_blocks + i * n_blocks + block]
+            entry = greedy_action(row, first, end, uniform, desk.random_ties)
+            worth += probabilities[i] * row[entry]
+            if desk.exploration == SHARED:
+                if held[block] >= 0:
+                    entry = held[block]
+            elif uniforms[2 + n_blocks + (k + i) * n_blocks + block] < rate:
+                entry = first + pick(uniform, end - first)
+            entries[i, block] = entry
+            for j in range(len(actions)):
+                actions[j] += probabilities[i] * desk.action_points[entry, j]
+    return worth / n_blocks
 
 
 @jit
@@ -126,7 +194,6 @@ def perceive_and_choose(observation, uniforms, rate, state, env, desk):
     :param desk: see :mod:`sb3_knntd.kernels.desk`
     :return: what the state is worth as a target
     """
-    indices, probabilities, means = desk.indices[state, env], desk.probabilities[state, env], desk.means[0]
     perceive(
         observation,
         desk.low,
@@ -138,23 +205,15 @@ def perceive_and_choose(observation, uniforms, rate, state, env, desk):
         desk.columns,
         desk.weights,
         desk.bandwidth,
-        indices,
-        probabilities,
+        desk.indices[state, env],
+        desk.probabilities[state, env],
     )
-    add_rows(
-        indices,
-        probabilities,
-        desk.values,
-        desk.row_slots,
-        desk.initial,
-        desk.live,
-        desk.live_slots,
-        desk.pace,
-        means,
-    )
-    action, worth = choose(means, uniforms, rate, desk.target, desk.exploration, desk.random_ties, desk.means[1])
-    desk.actions[state, env] = action
-    return worth
+    if desk.rule == AVERAGE:
+        return choose_average(uniforms, rate, state, env, desk)
+    # What would have been done after a truncation is done by nobody, and holds nothing up.
+    if desk.exploration == SHARED and state != LAST:
+        hold(uniforms, rate, env, desk)
+    return choose_each(uniforms, rate, state, env, desk)
 
 
 @jit
@@ -168,6 +227,7 @@ def begin(desk, observations, uniforms, rate):
     :param rate: ε or the temperature
     """
     for env in range(len(observations)):
+        desk.held[env, :] = UNDRAWN
         perceive_and_choose(observations[env], uniforms[env], rate, NOW, env, desk)
 
 
@@ -194,9 +254,9 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
         desk.counts,
         desk.pace,
     )
-    indices, probabilities, actions = desk.indices, desk.probabilities, desk.actions
+    indices, probabilities, entries, actions = desk.indices, desk.probabilities, desk.entries, desk.actions
     places, corrections = desk.places, desk.corrections
-    n_envs, k, n_actions = indices.shape[1], indices.shape[2], live.shape[1]
+    _, n_envs, k, n_blocks = entries.shape
     size, value_sum = 0.0, 0.0
 
     for env in range(n_envs):
@@ -205,6 +265,8 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
         for j in range(observations.shape[1]):
             if not np.isfinite(observations[env, j]):
                 return NOT_FINITE
+        if ended[env]:
+            desk.held[env, :] = UNDRAWN
         worth = perceive_and_choose(observations[env], uniforms[env, 0], rate, THEN, env, desk)
         if desk.truncated[env]:
             worth = perceive_and_choose(desk.last_observations[env], uniforms[env, 1], rate, LAST, env, desk)
@@ -217,7 +279,8 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
             )
             places[env, i] = place
             probability = probabilities[NOW, env, i]
-            value += probability * total(live, place, actions[NOW, env], pace)
+            for block in range(n_blocks):
+                value += probability * total(live, place, entries[NOW, env, i, block], pace) / n_blocks
             squares += probability * probability
         error = rewards[env] + desk.gamma * worth - value
         corrections[env] = learning_rate * error / squares if desk.normalized else learning_rate * error
@@ -227,17 +290,18 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
         value_sum += value
 
     for env in range(n_envs):
-        action = actions[NOW, env]
         for i in range(k):
-            place = places[env, i]
-            trace = probabilities[NOW, env, i] / pace[0]
-            if desk.accumulating:
-                trace += live[place, action, env]
-            elif desk.reset_others:
-                for other in range(n_actions):
-                    if other != action:
-                        set_trace(live, place, other, env, 0.0, pace)
-            set_trace(live, place, action, env, trace, pace)
+            place, trace = places[env, i], probabilities[NOW, env, i] / pace[0]
+            for block in range(n_blocks):
+                entry = entries[NOW, env, i, block]
+                if desk.accumulating:
+                    set_trace(live, place, entry, env, live[place, entry, env] + trace, pace)
+                    continue
+                if desk.reset_others:
+                    for other in range(desk.blocks[block], desk.blocks[block + 1]):
+                        if other != entry:
+                            set_trace(live, place, other, env, 0.0, pace)
+                set_trace(live, place, entry, env, trace, pace)
     for env in range(n_envs):
         pace[1 + env] += corrections[env] * pace[0]
     pace[0] *= desk.gamma * trace_decay
@@ -250,29 +314,42 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
     desk.sums[0] += size
     desk.sums[1] += value_sum
     for env in range(n_envs):
-        actions[NOW, env] = actions[THEN, env]
+        for j in range(actions.shape[2]):
+            actions[NOW, env, j] = actions[THEN, env, j]
         for i in range(k):
             indices[NOW, env, i] = indices[THEN, env, i]
             probabilities[NOW, env, i] = probabilities[THEN, env, i]
+            for block in range(n_blocks):
+                entries[NOW, env, i, block] = entries[THEN, env, i, block]
     return FINE
 
 
 @jit
-def best_actions(observations, eyes, indices, probabilities, values, row_slots, initial, actions):
+def best_entries(observations, eyes, indices, probabilities, values, row_slots, initial, blocks, average, entries):
     """
-    The greedy actions of a batch, ties to the first, read from the table alone.
+    The columns that the neighbours of a batch recommend, ties to the first, read from the table alone.
 
     :param observations: observation units, shape (batch, obs_dim)
     :param eyes: see :func:`~sb3_knntd.kernels.perceive.perceive`
-    :param indices: to be used, or with search ``FOUND`` given, shape (batch, k)
+    :param indices: to be filled, or with search ``FOUND`` given, shape (batch, k)
     :param probabilities: likewise
     :param values: see :mod:`sb3_knntd.kernels.memory`, and so ``row_slots`` and ``initial``
-    :param actions: to be filled, shape (batch,), int64
+    :param blocks: see :mod:`sb3_knntd.kernels.desk`
+    :param average: whether all recommend what is best by the average of their rows
+    :param entries: to be filled, shape (batch, k, n_blocks), int64
     """
     low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
-    means = np.empty(values.shape[1])
-    for i in range(len(observations)):
-        here, there, seen = indices[i], probabilities[i], observations[i]
+    means, row = np.empty(values.shape[1]), np.empty(values.shape[1])
+    _, k, n_blocks = entries.shape
+    for case in range(len(observations)):
+        here, there, seen = indices[case], probabilities[case], observations[case]
         perceive(seen, low, width, limit, search, axes, offsets, columns, weights, bandwidth, here, there)
-        add_stored_rows(here, there, values, row_slots, initial, means)
-        actions[i] = best_action(means)
+        means[:] = 0.0
+        for i in range(k):
+            read_stored_row(here[i], values, row_slots, initial, row)
+            for block in range(n_blocks):
+                entries[case, i, block] = best_action(row, blocks[block], blocks[block + 1])
+            for action in range(len(means)):
+                means[action] += there[i] * row[action]
+        if average:
+            entries[case, :, 0] = best_action(means, 0, len(means))

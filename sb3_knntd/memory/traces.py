@@ -25,7 +25,7 @@ class Traces(ABC):
         Set the traces of the state each environment is in.
 
         :param indices: points, shape (n_envs, k)
-        :param entries: the column of each, shape (n_envs, k)
+        :param entries: the columns of each, shape (n_envs, k, n_blocks)
         :param probabilities: what to set, shape (n_envs, k), the table's dtype
         """
 
@@ -82,12 +82,13 @@ class DenseTraces(Traces):
         self._envs = th.arange(n_envs, device=table.values.device)[:, None]
 
     def mark(self, indices: th.Tensor, entries: th.Tensor, probabilities: th.Tensor) -> None:
+        marked = (self._envs[..., None], indices[..., None], entries)
         if self.kind == "accumulating":
-            self.eligibility[self._envs, indices, entries] += probabilities
+            self.eligibility[marked] += probabilities[..., None]
             return
         if self.reset_other_actions:
             self.eligibility[self._envs, indices] = 0.0
-        self.eligibility[self._envs, indices, entries] = probabilities
+        self.eligibility[marked] = probabilities[..., None].expand(entries.shape)
 
     def credit(self, corrections: th.Tensor) -> None:
         total = th.tensordot(corrections, self.eligibility, dims=1)
@@ -138,8 +139,8 @@ class OneStepTraces(Traces):
         self._together, self._largest = self._values.new_zeros((2, len(self._values) if n_envs > 1 else 0))
 
     def mark(self, indices: th.Tensor, entries: th.Tensor, probabilities: th.Tensor) -> None:
-        self._marked = (indices * self._n_actions + entries).view(-1)
-        self._eligibility = probabilities.reshape(-1)
+        self._marked = (indices[..., None] * self._n_actions + entries).view(-1)
+        self._eligibility = probabilities[..., None].expand(entries.shape).reshape(-1)
 
     def credit(self, corrections: th.Tensor) -> None:
         moves = self._eligibility * corrections.repeat_interleave(

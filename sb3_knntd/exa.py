@@ -1,0 +1,174 @@
+"""Ex⟨a⟩(λ) for continuous actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.checks import check_number, check_word
+from sb3_knntd.policies import ExAPolicy
+from sb3_knntd.rules import ActionRule, ContinuousRule
+
+SelfExA = TypeVar("SelfExA", bound="ExA")
+
+
+class ExA(KNNAlgorithm):
+    """
+    Ex⟨a⟩(λ): each of the k nearest points recommends the best of a few action points, and the action is the mean of
+    what they recommend, weighted as the observation is (Algorithm 4 of the paper). With ``trace_decay=0`` it is Ex⟨a⟩.
+
+    The TD error is r + γ Σ p'(i) max Q(i, ·) - Σ p(i) Q(i, Iᵢ), with Iᵢ the entry that neighbour i answered for: where
+    nothing is explored both sums are eq. 25, and where something is, the value that was tried is the one corrected.
+
+    .. code-block:: python
+
+        model = ExA("Pendulum-v1", seed=0).learn(50_000)
+
+    Parameters not named here are those of :class:`~sb3_knntd.KNNTD`.
+
+    :param policy: the environment, as there is no policy to choose; or, in SB3's order, ``"KNNPolicy"``
+    :param env: the environment: a gymnasium id, an environment, or a VecEnv
+    :param action_points: the list A of eq. 19: an int >= 2 or one int a dimension for evenly spaced points over the
+        action space, or rising arrays, one a dimension, in action units. Few points learn faster: what lies between
+        them is reached by averaging
+    :param action_table: for several action dimensions: ``"joint"``, a column for every combination of their points;
+        ``"factored"``, columns for each dimension by itself, each with its own greedy index and one TD error for all;
+        ``None`` is joint up to 128 combinations
+    :param exploration: ``"shared"``: one column for all neighbours, held for some steps; ``"per_neighbor"`` (eq. 27):
+        one for each, which averages itself away as k grows
+    :param exploration_initial_eps: ε at the start, in [0, 1]: with ``"shared"`` the share of the time spent exploring
+    :param exploration_final_eps: ε at the end, in [0, 1]
+    :param exploration_fraction: share of the training over which ε changes, in (0, 1]
+    :param exploration_hold: for how many steps in the mean, >= 1, a shared draw of whether and what to explore is held
+    :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
+    """
+
+    policy: ExAPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": ExAPolicy}
+    _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Box
+    _action_space_advice: ClassVar[str] = "For Discrete actions use KNNTD"
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] | GymEnv = "KNNPolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: float | Schedule = LinearSchedule(0.5, 0.05, 1.0),  # noqa: B008
+        gamma: float = 0.99,
+        trace_decay: float | Schedule = 0.9,
+        n_neighbors: int | str = "auto",
+        points: Any = "auto",
+        bounds: Any = None,
+        weights: str | Callable[[th.Tensor], Any] = "inverse_quadratic",
+        bandwidth: float = 1.0,
+        search: str = "auto",
+        step_size: str = "normalized",
+        traces: str = "replacing",
+        reset_other_actions: bool = False,
+        action_points: Any = 3,
+        action_table: str | None = None,
+        exploration: str = "shared",
+        exploration_initial_eps: float = 0.9,
+        exploration_final_eps: float = 0.0,
+        exploration_fraction: float = 1.0,
+        exploration_hold: float = 20.0,
+        tie_break: str = "random",
+        initial_value: float = 0.0,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            gamma=gamma,
+            trace_decay=trace_decay,
+            n_neighbors=n_neighbors,
+            points=points,
+            bounds=bounds,
+            weights=weights,
+            bandwidth=bandwidth,
+            search=search,
+            step_size=step_size,
+            traces=traces,
+            reset_other_actions=reset_other_actions,
+            tie_break=tie_break,
+            initial_value=initial_value,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+        )
+        self.action_points = action_points
+        self.action_table = action_table
+        self.exploration = exploration
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_fraction = exploration_fraction
+        self.exploration_hold = exploration_hold
+        if _init_setup_model:
+            self._setup_model()
+
+    @classmethod
+    def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+        super()._check_spaces(observation_space, action_space)
+        # SB3 asserts it; here it gets a message that says what to do.
+        if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
+            raise ValueError(
+                f"{cls.__name__} takes actions in a Box with finite bounds; got {action_space}. Bound it by a "
+                "gymnasium.ActionWrapper"
+            )
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"action_points": self.action_points, "action_table": self.action_table}
+
+    def _make_rule(self) -> ActionRule:
+        check_word("exploration", self.exploration, ["shared", "per_neighbor"])
+        columns = self.policy.columns
+        return ContinuousRule(
+            columns.points,
+            columns.blocks,
+            self.exploration == "shared",
+            check_number("exploration_hold", self.exploration_hold, 1.0),
+            self.policy.n_neighbors,
+            self.tie_break == "random",
+        )
+
+    def _make_exploration_schedule(self) -> Schedule:
+        return self._make_epsilon_schedule()
+
+    def _env_actions(self, actions: np.ndarray) -> np.ndarray:
+        return self.policy.fit_actions(actions)
+
+    def _random_actions(self) -> np.ndarray:
+        uniforms, columns = self._stream.next()[:, 0], self.policy.columns
+        n_blocks = len(columns.blocks) - 1
+        sizes = np.diff(columns.blocks)
+        drawn = columns.blocks[:-1] + (uniforms[:, 2 : 2 + n_blocks] * sizes).astype(np.int64)
+        actions: np.ndarray = columns.points[drawn].sum(axis=1)
+        return actions
+
+    def learn(
+        self: SelfExA,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "ExA",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfExA:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
