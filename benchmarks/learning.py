@@ -56,9 +56,9 @@ TABLES = {
     ],
     "tuned": [Case("tuned", "MountainCar-v0", 20_000, -110, tuned=True)],
     "envs": [
-        Case("1 environment", "MountainCar-v0", 100_000),
-        Case("8 environments", "MountainCar-v0", 100_000, n_envs=8),
-        Case("64 environments", "MountainCar-v0", 100_000, n_envs=64),
+        Case("1 environment", "MountainCar-v0", 200_000),
+        Case("8 environments", "MountainCar-v0", 200_000, n_envs=8),
+        Case("64 environments", "MountainCar-v0", 200_000, n_envs=64),
     ],
 }
 

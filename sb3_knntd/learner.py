@@ -210,7 +210,7 @@ class TorchLearner(Learner):
         self.traces.mark(self.indices, self.entries, self.probabilities)
         self.traces.credit(corrections)
         self.traces.decay(self.form.gamma * rates[1], over)
-        self.table.visited[self.indices] = True
+        self.table.visit(self.indices)
         self._sums += th.stack((errors.abs().sum(), value.sum()))
         self._n_sums += self.n_envs
         return self._settle_in(perception, choice)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -11,7 +10,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 try:
     import numba
 
-    AVAILABLE = os.environ.get("NUMBA_DISABLE_JIT", "0") != "1"
+    AVAILABLE = not getattr(numba.config, "DISABLE_JIT", 0)
     #: why numba cannot be used, empty if it can
     REASON = "" if AVAILABLE else "NUMBA_DISABLE_JIT is set"
 except Exception as error:  # a numba that does not fit the installed NumPy raises more than ImportError
@@ -28,4 +27,7 @@ def jit(function: Function) -> Function:
     """
     if not AVAILABLE:
         return function
-    return cast(Function, numba.njit(cache=True, nogil=True)(function))
+    try:
+        return cast(Function, numba.njit(cache=True, nogil=True)(function))
+    except RuntimeError:  # there is no folder that numba may write to
+        return cast(Function, numba.njit(nogil=True)(function))

@@ -14,14 +14,14 @@ one is set). A step costs O(k · n_actions), whatever λ, the episode's length a
 The arrays, as far as a function takes them:
 
 values       the table, (n_rows, n_actions)
-visited      which rows have been learned at, (n_rows,), bool
+visited      which rows have been learned at, a bit each, uint8; empty if every row there is has been
 row_points   the point of each row, (n_rows,), int64
 row_slots    hash of the rows by point; empty if the points are the rows
 initial      value of a point without a row
 live_points  the live points, (capacity,), int64
 live         their entries, (capacity, n_actions, n_envs + 2): x of each environment, share, base
 live_slots   hash of the live points' places
-counts       (number of rows visited, number of live points), int64
+counts       (number of rows made, number of live points), int64
 pace         (c, G of each environment), (1 + n_envs,)
 
 A hash is an array (size, 2), int64, of points and places, filled by linear probing; its size is a power of two,
@@ -121,11 +121,11 @@ def enliven(point, values, visited, row_points, row_slots, live_points, live, li
     row = row_of(point, row_slots)
     if row < 0:
         row = counts[0]
+        counts[0] += 1
         row_points[row] = point
         insert(point, row, row_slots)
-    if not visited[row]:
-        visited[row] = True
-        counts[0] += 1
+    elif len(visited) > 0:
+        visited[row >> 3] |= np.uint8(1 << (row & 7))
     place = counts[1]
     counts[1] += 1
     live_points[place] = point

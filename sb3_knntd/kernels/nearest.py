@@ -58,6 +58,28 @@ def _extend(x, axes, first, end, dimension, ranked, squares, sides):
 
 
 @jit
+def _blurred(scaled, axes, offsets, total, ranked, squares, sides):
+    """
+    Whether two coordinates at different distances could give the same sum, of about ``total``, by rounding. If
+    not, equal sums have equal terms, of which the lower coordinate is ranked first: what comes out of the heap
+    later has a higher index.
+    """
+    n_dims = len(scaled)
+    least = 2.0 * n_dims * 2.3e-16 * total
+    for j in range(n_dims):
+        first, end = offsets[j], offsets[j + 1]
+        for place in range(first + 1, end):
+            if place - first >= sides[j, 0]:
+                _extend(scaled[j], axes, first, end, j, ranked, squares, sides)
+            if squares[place] > total + least:
+                break
+            difference = squares[place] - squares[place - 1]
+            if 0.0 < difference <= least:
+                return True
+    return False
+
+
+@jit
 def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
     """
     The k nearest points of a lattice, without visiting the others.
@@ -107,7 +129,12 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
     nodes[0, 0], nodes[0, 1], sums[0], order[0, 0] = number, 0, total, 0
     n_nodes, n_heap, n_taken = 1, 1, 0
 
-    while n_heap > 0 and (n_taken < k or sums[order[0, 0]] == sums[order[1, n_taken - 1]]):
+    while n_heap > 0:
+        if n_taken >= k:
+            if sums[order[0, 0]] != sums[order[1, n_taken - 1]]:
+                break
+            if n_taken == k and not _blurred(scaled, axes, offsets, sums[order[0, 0]], ranked, squares, sides):
+                break
         node = order[0, 0]
         n_heap -= 1
         order[0, 0] = order[0, n_heap]

@@ -33,14 +33,13 @@ class QTable(nn.Module, ABC):
     """
 
     values: th.Tensor
-    visited: th.Tensor
 
     def __init__(self, n_actions: int, initial_value: float) -> None:
         super().__init__()
         self.n_actions = n_actions
         self.initial_value = float(initial_value)
         self.lender: Lender | None = None
-        #: number of rows visited, number of live points: see :mod:`sb3_knntd.kernels.memory`
+        #: number of rows made, number of live points: see :mod:`sb3_knntd.kernels.memory`
         self.counts = np.zeros(2, np.int64)
 
     @property
@@ -112,15 +111,29 @@ class DenseTable(QTable):
     :param dtype: floating type of the entries
     """
 
+    visited: th.Tensor
+
     def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
         self.register_buffer("values", th.full((n_points, n_actions), self.initial_value, dtype=dtype))
-        #: which rows have been learned at, shape (n_points,)
-        self.register_buffer("visited", th.zeros(n_points, dtype=th.bool))
+        # Which rows have been learned at, a bit each, and one byte more than there are rows for.
+        self.register_buffer("visited", th.zeros((n_points + 7) // 8 + 1, dtype=th.uint8))
 
     @property
     def n_visited(self) -> int:
-        return int(self.visited.sum())
+        return int(np.unpackbits(self.visited[:-1].cpu().numpy()).sum())
+
+    def visit(self, indices: th.Tensor) -> None:
+        """
+        Note that points are learned at.
+
+        :param indices: points, any shape, int64
+        """
+        byte, bit = indices.reshape(-1) >> 3, indices.reshape(-1) & 7
+        for each in range(8):
+            # All that write to a byte at once write the same; points of another bit write to the byte to spare.
+            at = th.where(bit == each, byte, len(self.visited) - 1)
+            self.visited[at] = self.visited[at] | (1 << each)
 
     def entries(self) -> th.Tensor:
         self.sync()
@@ -166,7 +179,6 @@ class HashedTable(QTable):
     def __init__(self, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
         self.register_buffer("values", th.empty((0, n_actions), dtype=dtype))
-        self.register_buffer("visited", th.empty(0, dtype=th.bool))
         self.register_buffer("row_points", th.empty(0, dtype=th.int64))
         self._resize(self.SMALLEST)
 
@@ -199,10 +211,11 @@ class HashedTable(QTable):
         return True
 
     def arrays(self) -> tuple[Any, ...]:
-        return self.values.numpy(), self.visited.numpy(), self.row_points.numpy(), self._slots, self.initial_value
+        no_bits = np.empty(0, np.uint8)
+        return self.values.numpy(), no_bits, self.row_points.numpy(), self._slots, self.initial_value
 
     def _resize(self, capacity: int) -> None:
-        for name, fill in (("values", self.initial_value), ("visited", False), ("row_points", -1)):
+        for name, fill in (("values", self.initial_value), ("row_points", -1)):
             old = getattr(self, name)
             new = th.full((capacity, *old.shape[1:]), fill, dtype=old.dtype)
             new[: len(old)] = old[:capacity]
@@ -212,16 +225,19 @@ class HashedTable(QTable):
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        for name in ("values", "visited", "row_points"):
+        for name in ("values", "row_points"):
             destination[prefix + name] = destination[prefix + name][: self.n_visited].clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         self._forget_lent()
         n_rows = len(state_dict[prefix + "values"])
         self.counts[0] = 0
+        # Nothing of the rows there were may show through those to be made.
+        for name in ("values", "row_points"):
+            setattr(self, name, getattr(self, name)[:0])
         self._resize(max(self.SMALLEST, n_rows))
         state_dict = dict(state_dict)
-        for name in ("values", "visited", "row_points"):
+        for name in ("values", "row_points"):
             whole = getattr(self, name).clone()
             whole[:n_rows] = state_dict[prefix + name]
             state_dict[prefix + name] = whole

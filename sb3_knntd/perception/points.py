@@ -49,6 +49,11 @@ class Lattice(Points):
         self.shape = tuple(int(n) for n in shape)
         self.obs_dim = len(self.shape)
         self.n_points = math.prod(self.shape)
+        if self.n_points > np.iinfo(np.int64).max:
+            raise ValueError(
+                f"points: a lattice can have up to 2^63 - 1 points; got {self.shape}, which are {self.n_points:.3g}. "
+                "Give fewer points a dimension, 1 for dimensions that matter little"
+            )
         self.axes = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in self.shape]
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:

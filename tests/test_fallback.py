@@ -1,0 +1,245 @@
+"""Where numba cannot be used, or has nowhere to keep its results, everything still works, and says so."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch.overrides import TorchFunctionMode
+from toy_envs import DriftEnv
+
+from sb3_knntd import KNNTD
+
+HERE = pathlib.Path(__file__).parent
+PACKAGE = HERE.parent / "sb3_knntd"
+
+
+def learn(search: str = "auto", n_envs: int = 1, **arguments: Any) -> KNNTD:
+    """A run that does not depend on how it is computed: it acts on values that rounding does not make equal."""
+    env = DummyVecEnv([lambda n=n: DriftEnv(offset=0.3 * n) for n in range(n_envs)])
+    points: Any = (8, 6)
+    if search in ("kd_tree", "hnsw"):
+        points = np.random.default_rng(5).uniform(DriftEnv.LOW, DriftEnv.HIGH, size=(40, 2))
+    chosen: dict[str, Any] = {"learning_rate": 0.2, "gamma": 0.97, "trace_decay": 0.8, "n_neighbors": 4, "seed": 0}
+    chosen |= {"points": points, "bounds": (DriftEnv.LOW, DriftEnv.HIGH), "search": search, "tie_break": "first"}
+    return KNNTD(env, **{**chosen, **arguments}).learn(300 * n_envs)
+
+
+RUNS: dict[str, dict[str, Any]] = {
+    "defaults": {},
+    "lattice": {"search": "lattice"},
+    "kd_tree": {"search": "kd_tree"},
+    "environments": {"n_envs": 3, "traces": "accumulating", "learning_rate": 0.1},
+}
+
+# A process without numba: it learns what this one does, saves it, and tries what cannot be had.
+WITHOUT = """
+import json, sys, warnings
+with warnings.catch_warnings(record=True) as at_import:
+    warnings.simplefilter("always")
+    import test_fallback as shared
+    from sb3_knntd import KNNTD
+from sb3_knntd.learner import TorchLearner
+import numpy as np
+
+folder = sys.argv[1]
+report = {"import": [str(w.message) for w in at_import if "numba" in str(w.message)], "runs": {}}
+for name, arguments in shared.RUNS.items():
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = shared.learn(**arguments)
+    np.save(f"{folder}/{name}.npy", model.policy.q_table.numpy())
+    report["runs"][name] = {
+        "warnings": [[w.category.__name__, str(w.message)] for w in caught if "numba" in str(w.message)],
+        "torch": isinstance(model.learner, TorchLearner) and not model.policy.is_compiled,
+        "search": model.policy.search_name,
+    }
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    asked = shared.learn(policy_kwargs={"compiled": False})
+report["asked for torch"] = [str(w.message) for w in caught if "numba" in str(w.message)]
+warnings.simplefilter("ignore")
+shared.learn().save(f"{folder}/model")
+loaded = KNNTD.load(f"{folder}/model")
+report["loaded"] = bool((loaded.policy.q_table.numpy() == np.load(f"{folder}/defaults.npy")).all())
+report["actions"] = model.predict(np.zeros((3, 2), np.float32), deterministic=True)[0].tolist()
+report["refused"] = {}
+for name, arguments in {
+    "hashed": {"policy_kwargs": {"table": "hashed"}},
+    "large": {"points": (10_000, 10_000), "search": "lattice"},
+}.items():
+    try:
+        shared.learn(**arguments)
+        report["refused"][name] = None
+    except ValueError as error:
+        report["refused"][name] = str(error)
+print(json.dumps(report))
+"""
+
+
+def run_without(folder: pathlib.Path, **environment: str) -> dict[str, Any]:
+    paths = [environment.pop("PYTHONPATH", ""), str(HERE), str(HERE.parent)]
+    run = subprocess.run(
+        [sys.executable, "-c", WITHOUT, str(folder)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **environment},
+        capture_output=True,
+        text=True,
+        timeout=180,
+    )
+    assert run.returncode == 0, run.stderr[-3000:]
+    report: dict[str, Any] = json.loads(run.stdout.splitlines()[-1])
+    return {**report, "folder": folder}
+
+
+@pytest.fixture(scope="module", params=["disabled", "broken"])
+def without(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What a process without numba reports, and why it has none."""
+    folder = tmp_path_factory.mktemp(request.param)
+    if request.param == "disabled":
+        return {**run_without(folder, NUMBA_DISABLE_JIT="1"), "reason": "NUMBA_DISABLE_JIT"}
+    # A numba that does not fit the NumPy it finds raises this, and not only ImportError.
+    (folder / "numba").mkdir()
+    (folder / "numba" / "__init__.py").write_text("raise SystemError('bad initialization')\n")
+    return {**run_without(folder, PYTHONPATH=str(folder)), "reason": "bad initialization"}
+
+
+def test_a_warning_says_why(without: dict[str, Any]) -> None:
+    for run in without["runs"].values():
+        assert len(run["warnings"]) == 1
+        ((category, message),) = run["warnings"]
+        assert category == "UserWarning"
+        assert message.startswith("numba cannot be used")
+        assert without["reason"] in message
+        assert "torch" in message
+    # Importing is not using, and who asks for torch operations has nothing to be told.
+    assert without["import"] == []
+    assert without["asked for torch"] == []
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_same_is_learned_by_torch_operations(without: dict[str, Any], name: str) -> None:
+    assert without["runs"][name]["torch"]
+    model = learn(**RUNS[name])
+    assert model.policy.is_compiled
+    expected = model.policy.q_table.numpy()
+    assert np.abs(expected).max() > 0.1
+    np.testing.assert_allclose(np.load(without["folder"] / f"{name}.npy"), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_files_go_either_way(without: dict[str, Any]) -> None:
+    assert without["loaded"]
+    assert len(without["actions"]) == 3
+    model = KNNTD.load(without["folder"] / "model")
+    assert model.policy.is_compiled
+    np.testing.assert_array_equal(model.policy.q_table.numpy(), np.load(without["folder"] / "defaults.npy"))
+
+
+@pytest.mark.parametrize("table", ["hashed", "large"])
+def test_hashed_tables_are_refused(without: dict[str, Any], table: str) -> None:
+    message = without["refused"][table]
+    assert message is not None
+    assert "numba" in message
+    assert "'table': 'dense'" in message
+
+
+NOWHERE = """
+import sb3_knntd, test_fallback as shared
+assert sb3_knntd.__file__.startswith({folder!r}), sb3_knntd.__file__
+# Without a cache all else would have to be compiled anew, which takes long.
+print(shared.learn(policy_kwargs={{"compiled": False}}).policy.q_table.sum().item())
+"""
+
+
+def test_numba_has_nowhere_to_keep_its_results(tmp_path: pathlib.Path) -> None:
+    # As in a container whose file system is read-only and whose user has no home. numba says so when a function is
+    # decorated, at import; that must not be the end of the program.
+    shutil.copytree(PACKAGE, tmp_path / "sb3_knntd", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in (tmp_path / "sb3_knntd").rglob("*"):
+        if folder.is_dir():
+            (folder / "__pycache__").touch()
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
+    }
+    environment |= {"HOME": os.devnull, "PYTHONPATH": f"{tmp_path}{os.pathsep}{HERE}", "MPLCONFIGDIR": str(tmp_path)}
+    run = subprocess.run(
+        [sys.executable, "-c", NOWHERE.format(folder=str(tmp_path))],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert run.returncode == 0, run.stderr[-1500:]
+    assert float(run.stdout) == pytest.approx(learn().policy.q_table.sum().item(), rel=1e-9)
+
+
+# ------------------------------------------------------------------------------------------ accelerators
+
+cuda = pytest.mark.skipif(not th.cuda.is_available(), reason="there is no CUDA device here")
+
+
+@cuda
+@pytest.mark.parametrize("name", ["defaults", "environments", "kd_tree"])
+def test_the_same_is_learned_on_an_accelerator(name: str) -> None:
+    there = learn(**RUNS[name], device="cuda")
+    assert there.policy.device.type == "cuda"
+    assert not there.policy.is_compiled
+    expected = learn(**RUNS[name]).policy.q_table.numpy()
+    np.testing.assert_allclose(there.policy.q_table.cpu().numpy(), expected, rtol=1e-6, atol=1e-6)
+
+
+@cuda
+def test_hashed_tables_are_refused_on_an_accelerator() -> None:
+    with pytest.raises(ValueError, match="CPU"):
+        learn(policy_kwargs={"table": "hashed"}, device="cuda")
+
+
+class Waits(TorchFunctionMode):
+    """Counts what hands numbers of a tensor to Python, for which an accelerator has to be waited for."""
+
+    NAMES = ("cpu", "item", "tolist", "numpy", "nonzero", "__bool__", "__int__", "__float__", "__index__", "equal")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = getattr(func, "__name__", "")
+        # What has been fetched is in the host's memory, and costs nothing more.
+        fetched = name == "numpy" and self.counts["cpu"] > self.counts["numpy"]
+        if name in self.NAMES:
+            self.counts[name] += 1
+            self.counts["waits"] += not fetched
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=cuda)])
+@pytest.mark.parametrize("n_envs", [1, 5])
+def test_torch_operations_wait_once_a_step(device: str, n_envs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = learn(n_envs=n_envs, device=device, policy_kwargs={"compiled": False}, search="brute")
+    counted: list[Counter[str]] = []
+    learn_step = model.learner.learn
+
+    def counting(*arguments: Any) -> Any:
+        with Waits() as waits:
+            answer = learn_step(*arguments)
+        counted.append(waits.counts)
+        return answer
+
+    monkeypatch.setattr(model.learner, "learn", counting)
+    model.learn(60 * n_envs, log_interval=None)
+    assert len(counted) == 60
+    # The environments need their actions. On the CPU, where it costs nothing, a look at the errors comes on top.
+    allowed = 2 if device == "cpu" else 1
+    assert {counts["cpu"] for counts in counted} == {1}
+    assert max(counts["waits"] for counts in counted) <= allowed
