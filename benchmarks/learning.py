@@ -21,9 +21,10 @@ import torch as th
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.utils import LinearSchedule
 
 from benchmarks.machine import describe
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, ExA
 
 EPISODES = 100
 
@@ -37,7 +38,8 @@ class Case(NamedTuple):
     :param steps: environment steps of the training, over all environments together
     :param target: what the median must reach; ``None`` if there is nothing to reach
     :param n_envs: environments in step
-    :param tuned: whether the settings are those of ``zoo_configs/knntd.yml``
+    :param tuned: whether the settings are those of ``zoo_configs/``
+    :param algorithm: ``"knntd"`` or ``"exa"``
     """
 
     what: str
@@ -46,8 +48,10 @@ class Case(NamedTuple):
     target: float | None = None
     n_envs: int = 1
     tuned: bool = False
+    algorithm: str = "knntd"
 
 
+ALGORITHMS: dict[str, type[KNNTD] | type[ExA]] = {"knntd": KNNTD, "exa": ExA}
 TABLES = {
     "untuned": [
         Case("KNNTD(id)", "MountainCar-v0", 50_000, -130),
@@ -55,6 +59,12 @@ TABLES = {
         Case("KNNTD(id)", "Acrobot-v1", 50_000, -120),
     ],
     "tuned": [Case("tuned", "MountainCar-v0", 20_000, -110, tuned=True)],
+    "continuous": [
+        Case("ExA(id)", "Pendulum-v1", 50_000, algorithm="exa"),
+        Case("ExA(id)", "MountainCarContinuous-v0", 20_000, algorithm="exa"),
+        Case("tuned", "Pendulum-v1", 50_000, -200, tuned=True, algorithm="exa"),
+        Case("tuned", "MountainCarContinuous-v0", 10_000, 94, tuned=True, algorithm="exa"),
+    ],
     "envs": [
         Case("1 environment", "MountainCar-v0", 200_000),
         Case("8 environments", "MountainCar-v0", 200_000, n_envs=8),
@@ -63,12 +73,15 @@ TABLES = {
 }
 
 
-def tuned_settings(env_id: str) -> dict[str, Any]:
+def tuned_settings(algorithm: str, env_id: str) -> dict[str, Any]:
     """
+    :param algorithm: ``"knntd"`` or ``"exa"``
     :param env_id: environment
-    :return: its arguments in ``zoo_configs/knntd.yml``
+    :return: its arguments in ``zoo_configs/``, schedules in RL Zoo's form (``lin_0.7``) made into functions
     """
-    settings = yaml.safe_load(files("sb3_knntd.zoo_configs").joinpath("knntd.yml").read_text())[env_id]
+    settings = yaml.safe_load(files("sb3_knntd.zoo_configs").joinpath(f"{algorithm}.yml").read_text())[env_id]
+    if str(settings["learning_rate"]).startswith("lin_"):
+        settings["learning_rate"] = LinearSchedule(float(settings["learning_rate"][4:]), 0.0, 1.0)
     return {name: value for name, value in settings.items() if name not in ("n_timesteps", "policy")}
 
 
@@ -79,12 +92,14 @@ def play(case: Case, seed: int) -> float:
     :return: mean return of the greedy policy
     """
     th.set_num_threads(1)
-    settings = tuned_settings(case.env_id) if case.tuned else {}
-    model = KNNTD(make_vec_env(case.env_id, case.n_envs, seed=seed), seed=seed, **settings)
+    settings = tuned_settings(case.algorithm, case.env_id) if case.tuned else {}
+    venv = make_vec_env(case.env_id, case.n_envs, seed=seed)
+    model = ALGORITHMS[case.algorithm](venv, seed=seed, **settings)
     model.learn(case.steps)
     evaluation = make_vec_env(case.env_id, 10, seed=10_000 + seed)
     mean, _ = evaluate_policy(model, evaluation, n_eval_episodes=EPISODES, deterministic=True)
-    return float(mean)
+    assert isinstance(mean, float)
+    return mean
 
 
 def main() -> None:

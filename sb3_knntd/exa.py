@@ -25,14 +25,15 @@ class ExA(KNNAlgorithm):
     Ex⟨a⟩(λ): each of the k nearest points recommends the best of a few action points, and the action is the mean of
     what they recommend, weighted as the observation is (Algorithm 4 of the paper). With ``trace_decay=0`` it is Ex⟨a⟩.
 
-    The TD error is r + γ Σ p'(i) max Q(i, ·) - Σ p(i) Q(i, Iᵢ), with Iᵢ the entry that neighbour i answered for: where
-    nothing is explored both sums are eq. 25, and where something is, the value that was tried is the one corrected.
+    The TD error is r + γ Σ p'(i) max Q(i, ·) - Σ p(i) max Q(i, ·) (eqs. 24 and 25), also where something is explored:
+    the entries that were tried are moved by how much better or worse things went than the best ones promised.
 
     .. code-block:: python
 
         model = ExA("Pendulum-v1", seed=0).learn(50_000)
 
-    Parameters not named here are those of :class:`~sb3_knntd.KNNTD`.
+    Parameters not named here are those of :class:`~sb3_knntd.KNNTD`; the learning rate falls from 0.7 to 0.05 by
+    default.
 
     :param policy: the environment, as there is no policy to choose; or, in SB3's order, ``"KNNPolicy"``
     :param env: the environment: a gymnasium id, an environment, or a VecEnv
@@ -60,7 +61,7 @@ class ExA(KNNAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "KNNPolicy",
         env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = LinearSchedule(0.5, 0.05, 1.0),  # noqa: B008
+        learning_rate: float | Schedule = LinearSchedule(0.7, 0.05, 1.0),  # noqa: B008
         gamma: float = 0.99,
         trace_decay: float | Schedule = 0.9,
         n_neighbors: int | str = "auto",
@@ -78,7 +79,7 @@ class ExA(KNNAlgorithm):
         exploration_initial_eps: float = 0.9,
         exploration_final_eps: float = 0.0,
         exploration_fraction: float = 1.0,
-        exploration_hold: float = 20.0,
+        exploration_hold: float = 5.0,
         tie_break: str = "random",
         initial_value: float = 0.0,
         stats_window_size: int = 100,

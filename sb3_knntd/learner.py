@@ -255,8 +255,7 @@ class TorchLearner(Learner):
 
     def _value(self) -> th.Tensor:
         """Q(s, a) at the state and action that each environment is leaving, shape (n_envs,)."""
-        taken = self.table.rows(self.indices).gather(2, self.entries).mean(dim=2)
-        return (self.probabilities * taken).sum(dim=1)
+        return self.rule.value(self.table.rows(self.indices), self.probabilities, self.entries)
 
     def _settle_in(self, perception: Perception, choice: Choice) -> np.ndarray:
         self.indices.copy_(perception.indices)

@@ -74,6 +74,17 @@ class ActionRule(ABC):
         """
 
     @abstractmethod
+    def value(self, rows: th.Tensor, probabilities: th.Tensor, entries: th.Tensor) -> th.Tensor:
+        """
+        What a state and the action taken in it are worth by the table as it is.
+
+        :param rows: table rows of the neighbours, shape (batch, k, n_actions)
+        :param probabilities: of the neighbours, shape (batch, k), the table's dtype
+        :param entries: the columns that were answered for, shape (batch, k, n_blocks)
+        :return: shape (batch,)
+        """
+
+    @abstractmethod
     def kernel_arguments(self) -> tuple[Any, ...]:
         """
         :return: ``RULE`` of :mod:`sb3_knntd.kernels.desk`
@@ -142,6 +153,9 @@ class DiscreteRule(ActionRule):
             worth = self.exploration.expectation(values, rate)
         return Choice(actions, actions[:, None, None].expand(*probabilities.shape, 1), worth)
 
+    def value(self, rows: th.Tensor, probabilities: th.Tensor, entries: th.Tensor) -> th.Tensor:
+        return (probabilities * rows.gather(2, entries)[..., 0]).sum(dim=1)
+
 
 class ContinuousRule(ActionRule):
     """
@@ -196,11 +210,10 @@ class ContinuousRule(ActionRule):
         batch, k, _ = rows.shape
         _, _, _, ties, explore = uniforms.split(self._parts, dim=1)
         ties = ties.reshape(batch, k, -1)
-        entries, worth = [], probabilities.new_zeros(batch)
+        entries = []
         for block, (first, end) in enumerate(pairwise(self.blocks.tolist())):
             part = rows[..., first:end]
             entry = first + greedy(part, ties[..., block] if self.random_ties else None)
-            worth = worth + (probabilities * part.amax(dim=-1)).sum(dim=1)
             if self.shared:
                 entry = th.where(held[:, block, None] >= 0, held[:, block, None], entry)
             else:
@@ -209,4 +222,8 @@ class ContinuousRule(ActionRule):
             entries.append(entry)
         chosen = th.stack(entries, dim=2)
         points = th.from_numpy(self.action_points).to(probabilities)
-        return Choice(mean_actions(chosen, probabilities, points), chosen, worth / len(entries))
+        return Choice(mean_actions(chosen, probabilities, points), chosen, self.value(rows, probabilities, chosen))
+
+    def value(self, rows: th.Tensor, probabilities: th.Tensor, entries: th.Tensor) -> th.Tensor:
+        best = [rows[..., first:end].amax(dim=-1) for first, end in pairwise(self.blocks.tolist())]
+        return (probabilities * th.stack(best, dim=2).mean(dim=2)).sum(dim=1)

@@ -91,7 +91,7 @@ def test_learning_plays_a_case(benchmarks: Any) -> None:
 
 
 def test_learning_takes_the_tuned_settings(benchmarks: Any) -> None:
-    settings = benchmarks("learning").tuned_settings("MountainCar-v0")
+    settings = benchmarks("learning").tuned_settings("knntd", "MountainCar-v0")
     assert settings
     assert not {"n_timesteps", "policy"} & set(settings)
 

@@ -94,6 +94,17 @@ def total(live, place, action, pace):
 
 
 @jit
+def best_live_entry(live, place, first, end, pace):
+    """The first of the best columns of a live point, from ``first`` to before ``end``."""
+    best, largest = first, total(live, place, first, pace)
+    for action in range(first + 1, end):
+        value = total(live, place, action, pace)
+        if value > largest:
+            best, largest = action, value
+    return best
+
+
+@jit
 def read_row(point, values, row_slots, initial, live, live_slots, pace, row):
     """Write the values of a point's actions into ``row``, shape (n_actions,)."""
     place = find(point, live_slots)

@@ -7,6 +7,7 @@ import numpy as np
 from sb3_knntd.kernels.jit import jit
 from sb3_knntd.kernels.memory import (
     LEAST_CLOCK,
+    best_live_entry,
     end_episode,
     enliven,
     read_row,
@@ -280,7 +281,10 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
             places[env, i] = place
             probability = probabilities[NOW, env, i]
             for block in range(n_blocks):
-                value += probability * total(live, place, entries[NOW, env, i, block], pace) / n_blocks
+                entry = entries[NOW, env, i, block]
+                if desk.rule == EACH:
+                    entry = best_live_entry(live, place, desk.blocks[block], desk.blocks[block + 1], pace)
+                value += probability * total(live, place, entry, pace) / n_blocks
             squares += probability * probability
         error = rewards[env] + desk.gamma * worth - value
         corrections[env] = learning_rate * error / squares if desk.normalized else learning_rate * error
