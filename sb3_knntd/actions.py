@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -49,18 +50,18 @@ def make_action_columns(action_space: spaces.Box, action_points: Any, action_tab
             "gymnasium.wrappers.RescaleAction or a Box of your own"
         )
     lists = [
-        _points_of_dimension(dimension, given, low[dimension], high[dimension])
+        _points_of_dimension(dimension, given, low[dimension], high[dimension], action_space.dtype)
         for dimension, given in enumerate(_by_dimension(action_points, len(low)))
     ]
-    n_joint = int(np.prod([float(len(points)) for points in lists]))
+    n_joint = math.prod(len(points) for points in lists)
     if action_table is None:
         action_table = "joint" if n_joint <= MOST_JOINT_COLUMNS else "factored"
     check_word("action_table", action_table, ["joint", "factored"])
     if action_table == "joint":
         if n_joint > MOST_COLUMNS:
             raise ValueError(
-                f"action_table='joint' would need {n_joint:,} columns ({' × '.join(str(len(p)) for p in lists)}), "
-                f"{n_joint * 8 / 2**20:,.0f} MiB for each point visited: use action_table='factored', or fewer "
+                f"action_table='joint' would need {n_joint:,} columns for {len(lists)} action dimensions, "
+                f"{n_joint * 8 // 2**20:,} MiB for each point visited: use action_table='factored', or fewer "
                 "action_points"
             )
         return ActionColumns(np.array(list(product(*lists))), np.array([0, n_joint]), lists)
@@ -74,7 +75,7 @@ def make_action_columns(action_space: spaces.Box, action_points: Any, action_tab
 def _by_dimension(action_points: Any, action_dim: int) -> list[Any]:
     if isinstance(action_points, str):
         raise ValueError(f"action_points must be an int, one int a dimension, or arrays; got {action_points!r}")
-    if np.ndim(action_points) == 0 and not isinstance(action_points, (list, tuple)):
+    if not isinstance(action_points, (list, tuple)) and np.ndim(action_points) == 0:
         return [check_integer("action_points", action_points, 2)] * action_dim
     given = list(action_points)
     # For one dimension the list of points itself may stand for the list of lists.
@@ -88,9 +89,9 @@ def _by_dimension(action_points: Any, action_dim: int) -> list[Any]:
     return given
 
 
-def _points_of_dimension(dimension: int, given: Any, low: float, high: float) -> np.ndarray:
+def _points_of_dimension(dimension: int, given: Any, low: float, high: float, dtype: Any) -> np.ndarray:
     name = f"action_points of dimension {dimension}"
-    if np.ndim(given) == 0:
+    if not isinstance(given, (list, tuple)) and np.ndim(given) == 0:
         return np.linspace(low, high, check_integer(name, given, 2))
     try:
         points = np.asarray(given, dtype=np.float64)
@@ -98,6 +99,9 @@ def _points_of_dimension(dimension: int, given: Any, low: float, high: float) ->
         raise ValueError(f"{name} must be numbers; got {given!r}") from error
     if points.ndim != 1 or len(points) == 0:
         raise ValueError(f"{name} must be a list of at least one number; got {given!r}")
+    # A bound of the space is what its type made of the number that was meant, 0.7 in float32 say.
+    for bound in (low, high):
+        points = np.where(points.astype(dtype) == bound, bound, points)
     if not np.isfinite(points).all() or points.min() < low or points.max() > high:
         raise ValueError(f"{name} must lie within the action space, [{low:g}, {high:g}]; got {points.tolist()}")
     if np.any(np.diff(points) <= 0):

@@ -323,7 +323,9 @@ class ExAPolicy(KNNPolicy):
         """
         space = self.action_space
         assert isinstance(space, spaces.Box)
-        fitting: np.ndarray = np.clip(actions.reshape(-1, *space.shape).astype(space.dtype), space.low, space.high)
+        whole = np.issubdtype(space.dtype, np.integer)
+        actions = (np.rint(actions) if whole else actions).reshape(-1, *space.shape)
+        fitting: np.ndarray = np.clip(actions.astype(space.dtype), space.low, space.high)
         return fitting
 
     def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
@@ -335,7 +337,8 @@ class ExAPolicy(KNNPolicy):
         blocks = self.columns.blocks.tolist()
         entries = [first + greedy(rows[..., first:end]) for first, end in pairwise(blocks)]
         points = th.from_numpy(self.columns.points).to(probabilities)
-        return mean_actions(th.stack(entries, dim=2), probabilities, points)
+        actions = mean_actions(th.stack(entries, dim=2), probabilities, points)
+        return th.from_numpy(self.fit_actions(actions.cpu().numpy()))
 
 
 def _count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:

@@ -90,21 +90,15 @@ class ReferenceExA:
         # Each part speaks for one dimension, or the only part for all.
         return np.concatenate(means)
 
-    def worth(self, state: Any) -> float:
+    def worth(self, neighbours: Neighbours) -> float:
         """Eq. 25: the mean of the neighbours' best values."""
-        indices, p = self.perceive(state)
+        indices, p = neighbours
         return float(np.mean([np.sum(p * table[indices].max(axis=1)) for table in self.tables]))
 
-    def value(self, choice: Choice) -> float:
-        """What was expected of the entries that were answered for."""
-        indices, p = choice.neighbours
-        columns = zip(self.tables, choice.entries.T, strict=True)
-        return float(np.mean([np.sum(p * table[indices, column]) for table, column in columns]))
-
     def td_error(self, step: Transition) -> float:
-        """Eq. 24, with the value that was tried as the one to be corrected."""
-        ahead = 0.0 if step.terminated else self.worth(step.next_state)
-        return step.reward + self.gamma * ahead - self.value(step.choice)
+        """Eq. 24, both states by eq. 25."""
+        ahead = 0.0 if step.terminated else self.worth(self.perceive(step.next_state))
+        return step.reward + self.gamma * ahead - self.worth(step.choice.neighbours)
 
     def mark(self, env: int, choice: Choice) -> None:
         """Eq. 26: one environment's traces become aware of what its neighbours answered for."""

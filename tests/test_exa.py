@@ -756,7 +756,7 @@ def test_single_precision() -> None:
         ({"action_points": [[float("nan")], 2]}, ["action_points of dimension 0", "nan"]),
         ({"action_points": [["left"], 2]}, ["action_points of dimension 0", "numbers", "left"]),
         ({"action_table": "both"}, ["action_table", "'joint'", "'factored'", "'both'"]),
-        ({"action_table": "joint", "action_points": 1200}, ["1,440,000 columns", "1200 × 1200", "'factored'"]),
+        ({"action_table": "joint", "action_points": 1200}, ["1,440,000 columns", "2 action dimensions", "'factored'"]),
         ({"exploration": "softmax"}, ["exploration", "'shared'", "'per_neighbor'", "'softmax'"]),
         ({"exploration_hold": 0.5}, ["exploration_hold", "[1, inf)", "0.5"]),
         ({"exploration_hold": float("nan")}, ["exploration_hold", "nan"]),
