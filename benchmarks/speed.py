@@ -339,7 +339,7 @@ class Pauses(BaseCallback):
 def growth_pause(repeats: int) -> Row:
     pauses, rows = [], 0
     for _ in range(min(repeats, 2)):
-        model = KNNTD(make_vec_env(lambda: Drift(12), 1, seed=0), points=100, n_neighbors=25, seed=0)
+        model = KNNTD(make_vec_env(lambda: Drift(12), 1, seed=0), points=30, n_neighbors=25, seed=0)
         watch = Pauses()
         model.learn(20_000, callback=watch)
         pauses.append(watch.longest)

@@ -124,9 +124,11 @@ def choose_average(uniforms, rate, state, env, desk):
     """One action from the average of the neighbours' rows. The arguments are those of :func:`perceive_and_choose`."""
     indices, probabilities, entries = desk.indices[state, env], desk.probabilities[state, env], desk.entries[state, env]
     means, row = desk.means[0], desk.means[1]
+    # Taken off the desk once: numba counts references to an array each time it is.
+    values, row_slots, live, live_slots, pace = desk.values, desk.row_slots, desk.live, desk.live_slots, desk.pace
     means[:] = 0.0
     for i in range(len(indices)):
-        read_row(indices[i], desk.values, desk.row_slots, desk.initial, desk.live, desk.live_slots, desk.pace, row)
+        read_row(indices[i], values, row_slots, desk.initial, live, live_slots, pace, row)
         for action in range(len(means)):
             means[action] += probabilities[i] * row[action]
     action, worth = choose(means, uniforms, rate, desk.target, desk.exploration, desk.random_ties, row)
@@ -161,11 +163,13 @@ def choose_each(uniforms, rate, state, env, desk):
     """
     indices, probabilities, entries = desk.indices[state, env], desk.probabilities[state, env], desk.entries[state, env]
     held, blocks, row, actions = desk.held[env], desk.blocks, desk.means[0], desk.actions[state, env]
+    values, row_slots, live, live_slots, pace = desk.values, desk.row_slots, desk.live, desk.live_slots, desk.pace
+    action_points = desk.action_points
     k, n_blocks = entries.shape
     actions[:] = 0.0
     worth = 0.0
     for i in range(k):
-        read_row(indices[i], desk.values, desk.row_slots, desk.initial, desk.live, desk.live_slots, desk.pace, row)
+        read_row(indices[i], values, row_slots, desk.initial, live, live_slots, pace, row)
         for block in range(n_blocks):
             first, end = blocks[block], blocks[block + 1]
             uniform = uniforms[2 + n_blocks + i * n_blocks + block]
@@ -178,7 +182,7 @@ def choose_each(uniforms, rate, state, env, desk):
                 entry = first + pick(uniform, end - first)
             entries[i, block] = entry
             for j in range(len(actions)):
-                actions[j] += probabilities[i] * desk.action_points[entry, j]
+                actions[j] += probabilities[i] * action_points[entry, j]
     return worth / n_blocks
 
 
@@ -256,7 +260,7 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
         desk.pace,
     )
     indices, probabilities, entries, actions = desk.indices, desk.probabilities, desk.entries, desk.actions
-    places, corrections = desk.places, desk.corrections
+    places, corrections, blocks = desk.places, desk.corrections, desk.blocks
     _, n_envs, k, n_blocks = entries.shape
     size, value_sum = 0.0, 0.0
 
@@ -283,7 +287,7 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
             for block in range(n_blocks):
                 entry = entries[NOW, env, i, block]
                 if desk.rule == EACH:
-                    entry = best_live_entry(live, place, desk.blocks[block], desk.blocks[block + 1], pace)
+                    entry = best_live_entry(live, place, blocks[block], blocks[block + 1], pace)
                 value += probability * total(live, place, entry, pace) / n_blocks
             squares += probability * probability
         error = rewards[env] + desk.gamma * worth - value
@@ -302,7 +306,7 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
                     set_trace(live, place, entry, env, live[place, entry, env] + trace, pace)
                     continue
                 if desk.reset_others:
-                    for other in range(desk.blocks[block], desk.blocks[block + 1]):
+                    for other in range(blocks[block], blocks[block + 1]):
                         if other != entry:
                             set_trace(live, place, other, env, 0.0, pace)
                 set_trace(live, place, entry, env, trace, pace)
