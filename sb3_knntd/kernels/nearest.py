@@ -86,8 +86,9 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
 
     A squared distance is a sum over the dimensions, so that with each dimension's coordinates ranked by
     distance the points come out of a heap in order: a point is followed by those one rank further in one
-    dimension. Rounding keeps sums in that order, and all that equal the k-th are taken out before the
-    lower indices among them are chosen, so that the answer is that of a search over all points.
+    dimension. Rounding keeps sums in that order. Points that tie come out by rising index, unless rounding could have
+    made them tie; then all that equal the k-th are taken out before the lower indices among them are chosen. So the
+    answer is that of a search over all points.
 
     :param scaled: observation, scaled units, shape (obs_dim,)
     :param axes: the coordinates of every dimension one after the other, each rising
