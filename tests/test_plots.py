@@ -190,7 +190,8 @@ def test_known_environments_are_drawn_with_their_names() -> None:
 def test_names_fit_their_environment(env_id: str) -> None:
     env = gym.make(env_id)
     assert env.observation_space.shape == (len(NAMES[env_id].observations),)
-    assert env.action_space.n == len(NAMES[env_id].actions)  # type: ignore[attr-defined]
+    n_actions = env.action_space.n if isinstance(env.action_space, spaces.Discrete) else env.action_space.shape[0]  # type: ignore[index]
+    assert len(NAMES[env_id].actions) == n_actions
 
 
 def test_unknown_environments_are_drawn_with_numbers() -> None:
