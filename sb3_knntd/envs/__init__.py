@@ -9,15 +9,21 @@ import gymnasium as gym
 
 from sb3_knntd.envs.acrobot import AcrobotEnv
 from sb3_knntd.envs.cart_pole import CartPoleEnv, ContinuousCartPoleEnv
+from sb3_knntd.envs.generalized_mountain_car import GeneralizedMountainCarEnv
 from sb3_knntd.envs.mountain_car import MountainCarEnv
 
-__all__ = ["AcrobotEnv", "CartPoleEnv", "ContinuousCartPoleEnv", "MountainCarEnv"]
+__all__ = ["AcrobotEnv", "CartPoleEnv", "ContinuousCartPoleEnv", "GeneralizedMountainCarEnv", "MountainCarEnv"]
 
 for _id, _entry_point, _steps in (
     ("sb3_knntd/MountainCar-v0", "sb3_knntd.envs.mountain_car:MountainCarEnv", 1000),
     ("sb3_knntd/CartPole-v0", "sb3_knntd.envs.cart_pole:CartPoleEnv", 1000),
     ("sb3_knntd/ContinuousCartPole-v0", "sb3_knntd.envs.cart_pole:ContinuousCartPoleEnv", 1000),
     ("sb3_knntd/Acrobot-v0", "sb3_knntd.envs.acrobot:AcrobotEnv", 500),
+    (
+        "sb3_knntd/GeneralizedMountainCar-v0",
+        "sb3_knntd.envs.generalized_mountain_car:GeneralizedMountainCarEnv",
+        1000,
+    ),
 ):
     # A module that is loaded again would only make gymnasium warn.
     if _id not in gym.registry:

@@ -35,6 +35,7 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
     :param start: one of these words, or a state
     :param noise: standard deviation of the noise as a share of ``ranges``, a number or one number a dimension
     :param render_mode: None, "human" or "rgb_array"
+    :param state_space: a Box of the states, shape (state_dim,); None if it is the observation space
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
@@ -50,10 +51,12 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
         start: str | Sequence[float],
         noise: float | Sequence[float],
         render_mode: str | None,
+        state_space: spaces.Box | None = None,
     ) -> None:
         if render_mode is not None:
             check_word("render_mode", render_mode, self.metadata["render_modes"])
         self.observation_space: spaces.Box = observation_space  # type: ignore[assignment]
+        self._state_space = observation_space if state_space is None else state_space
         self._low = observation_space.low.astype(np.float64)
         self._high = observation_space.high.astype(np.float64)
         self.render_mode = render_mode
@@ -116,7 +119,7 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
             state = np.array(value, dtype=np.float64)
         except (TypeError, ValueError):
             state = np.empty(0)
-        low, high = self.observation_space.low, self.observation_space.high
+        low, high = self._state_space.low, self._state_space.high
         # In the space's own precision, or its limits would not always be in it.
         with np.errstate(over="ignore"):
             rounded = state.astype(np.float32)

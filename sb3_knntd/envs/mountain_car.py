@@ -22,7 +22,7 @@ FORCE = 0.001
 GRAVITY = 0.0025
 
 
-def mountain_car_step(state: tuple[float, float], action: int) -> tuple[float, float]:
+def mountain_car_step(state: tuple[float, float], action: int, force: float = FORCE) -> tuple[float, float]:
     """
     One step of the standard Mountain-Car (Sutton and Barto, "Reinforcement Learning", 2nd edition, example 10.1).
 
@@ -30,10 +30,11 @@ def mountain_car_step(state: tuple[float, float], action: int) -> tuple[float, f
 
     :param state: position in [-1.2, 0.6] and velocity in [-0.07, 0.07], position units a step
     :param action: 0, 1 or 2 for an engine pushing left, idle or pushing right
+    :param force: what a push adds to the velocity
     :return: the state after the step
     """
     position, velocity = state[0], state[1]
-    velocity += FORCE * (action - 1) - GRAVITY * math.cos(3.0 * position)
+    velocity += force * (action - 1) - GRAVITY * math.cos(3.0 * position)
     velocity = min(max(velocity, -MAX_SPEED), MAX_SPEED)
     position = min(max(position + velocity, MIN_POSITION), MAX_POSITION)
     if position == MIN_POSITION and velocity < 0.0:
@@ -172,35 +173,51 @@ class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
         self._push = 0
 
     def _make_canvas(self, human: bool) -> Canvas:
-        return Canvas(
-            (600, 400), (-0.32, 0.62), 600 / 2.1, human=human, fps=self.metadata["render_fps"], caption="Mountain-Car"
-        )
+        return mountain_car_canvas(human, self.metadata["render_fps"], "Mountain-Car")
 
     def _draw(self, canvas: Canvas, state: State) -> None:
-        position = state[0]
-        canvas.fill(SKY)
-        places = np.linspace(-1.4, 0.8, 147).tolist()
-        ridge = [(x, _height(x)) for x in places]
-        canvas.polygon([(places[0], -1.0), *ridge, (places[-1], -1.0)], GROUND)
-        canvas.path(ridge, 0.012, STEEL)
+        draw_mountain_car(canvas, state[0], self._push)
 
-        wall = MIN_POSITION - 0.12
-        canvas.bar((wall, _height(wall)), (wall, _height(wall) + 0.16), 0.025, INK)
 
-        top = _height(GOAL_POSITION) + 0.25
-        canvas.bar((GOAL_POSITION, _height(GOAL_POSITION)), (GOAL_POSITION, top), 0.012, INK)
-        canvas.polygon([(GOAL_POSITION, top), (GOAL_POSITION + 0.12, top - 0.04), (GOAL_POSITION, top - 0.08)], GREEN)
+def mountain_car_canvas(human: bool, fps: int, caption: str) -> Canvas:
+    """
+    :param human: whether to open a window
+    :param fps: the most frames a second a window shows
+    :param caption: title of the window
+    :return: a board with the whole valley in view, for :func:`draw_mountain_car`
+    """
+    return Canvas((600, 400), (-0.32, 0.62), 600 / 2.1, human=human, fps=fps, caption=caption)
 
-        slope = math.atan(_slope(position))
-        ground = (position, _height(position))
-        body = [(-0.11, 0.04), (0.11, 0.04), (0.11, 0.08), (0.06, 0.1), (0.03, 0.16), (-0.06, 0.16), (-0.1, 0.1)]
-        canvas.polygon(turned(body, slope, ground), BLUE)
-        for wheel in turned([(-0.065, 0.038), (0.065, 0.038)], slope, ground):
-            canvas.circle(wheel, 0.034, INK)
-            canvas.circle(wheel, 0.013, GROUND)
-        if self._push:
-            tail, tip = turned([(0.0, 0.21), (0.14 * self._push, 0.21)], slope, ground)
-            canvas.arrow(tail, tip, 0.014, ORANGE)
+
+def draw_mountain_car(canvas: Canvas, position: float, push: int) -> None:
+    """
+    :param canvas: from :func:`mountain_car_canvas`
+    :param position: of the car, in [-1.2, 0.6]
+    :param push: -1, 0 or 1 for an engine pushing left, idle or pushing right
+    """
+    canvas.fill(SKY)
+    places = np.linspace(-1.4, 0.8, 147).tolist()
+    ridge = [(x, _height(x)) for x in places]
+    canvas.polygon([(places[0], -1.0), *ridge, (places[-1], -1.0)], GROUND)
+    canvas.path(ridge, 0.012, STEEL)
+
+    wall = MIN_POSITION - 0.12
+    canvas.bar((wall, _height(wall)), (wall, _height(wall) + 0.16), 0.025, INK)
+
+    top = _height(GOAL_POSITION) + 0.25
+    canvas.bar((GOAL_POSITION, _height(GOAL_POSITION)), (GOAL_POSITION, top), 0.012, INK)
+    canvas.polygon([(GOAL_POSITION, top), (GOAL_POSITION + 0.12, top - 0.04), (GOAL_POSITION, top - 0.08)], GREEN)
+
+    slope = math.atan(_slope(position))
+    ground = (position, _height(position))
+    body = [(-0.11, 0.04), (0.11, 0.04), (0.11, 0.08), (0.06, 0.1), (0.03, 0.16), (-0.06, 0.16), (-0.1, 0.1)]
+    canvas.polygon(turned(body, slope, ground), BLUE)
+    for wheel in turned([(-0.065, 0.038), (0.065, 0.038)], slope, ground):
+        canvas.circle(wheel, 0.034, INK)
+        canvas.circle(wheel, 0.013, GROUND)
+    if push:
+        tail, tip = turned([(0.0, 0.21), (0.14 * push, 0.21)], slope, ground)
+        canvas.arrow(tail, tip, 0.014, ORANGE)
 
 
 def _height(position: float) -> float:
