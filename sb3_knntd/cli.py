@@ -10,9 +10,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from sb3_knntd.zoo import SCRIPTS
+from sb3_knntd.zoo import run as run_script
+
 if TYPE_CHECKING:
     # argparse's own class is generic only in type stubs.
     Subparsers = argparse._SubParsersAction["Parser"]
+    AddCommand = Callable[[Subparsers], None]
 
 #: Exit code after Ctrl-C, the shell's own for it.
 INTERRUPTED = 130
@@ -63,14 +67,15 @@ def seed_int(text: str) -> int:
     return number
 
 
-def require(*modules: str) -> None:
+def require(*modules: str, extra: str = "extra") -> None:
     """
     :param modules: modules that the command cannot do without
+    :param extra: extra of this package that installs them
     :raises CommandError: if some of them are not installed
     """
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
-        raise CommandError(f'{" and ".join(missing)} not installed: pip install "sb3-knntd[extra]"')
+        raise CommandError(f'{" and ".join(missing)} not installed: pip install "sb3-knntd[{extra}]"')
 
 
 def _add_demo(subparsers: Subparsers) -> None:
@@ -98,23 +103,42 @@ def _run_demo(args: argparse.Namespace) -> int:
     return 0 if demo(args.env, args.steps, args.seed, args.out) else INTERRUPTED
 
 
-#: Each adds one command: its parser, and with ``set_defaults(run=...)`` the function that runs it and returns
-#: the exit code.
-COMMANDS: tuple[Callable[[Subparsers], None], ...] = (_add_demo,)
+def add_zoo(subparsers: Subparsers) -> None:
+    """
+    Add RL Zoo's scripts, each as a command that takes RL Zoo's own arguments.
+
+    :param subparsers: where to add them
+    """
+    for name, script in SCRIPTS.items():
+        # No argument can begin with a zero byte: all are taken as they are, and RL Zoo reads them.
+        parser = subparsers.add_parser(name, help=script.help, add_help=False, prefix_chars="\0")
+        parser.add_argument("arguments", nargs=argparse.REMAINDER)
+        parser.set_defaults(run=_run_zoo)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def _run_zoo(args: argparse.Namespace) -> int:
+    require("rl_zoo3", *SCRIPTS[args.command].needs, extra="zoo")
+    run_script(args.command, args.arguments)
+    return 0
+
+
+#: Each adds one command or several: the parser, and with ``set_defaults(run=...)`` the function that runs it and
+#: returns the exit code.
+COMMANDS: tuple[AddCommand, ...] = (_add_demo, add_zoo)
+
+
+def main(argv: Sequence[str] | None = None, prog: str = "sb3-knntd", commands: Sequence[AddCommand] = COMMANDS) -> int:
     """
     :param argv: arguments of the command line, without the program's name; by default those it was called with
+    :param prog: the program's name
+    :param commands: the commands it has
     :return: exit code
     :raises SystemExit: with code 2 after a mistake of the user's, with 0 after ``--help`` and ``--version``
     """
-    parser = Parser(
-        prog="sb3-knntd", description="kNN-TD(λ) for Stable-Baselines3: a table at k nearest points, no network."
-    )
+    parser = Parser(prog=prog, description="kNN-TD(λ) for Stable-Baselines3: a table at k nearest points, no network.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('sb3-knntd')}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    for add_command in COMMANDS:
+    for add_command in commands:
         add_command(subparsers)
     args = parser.parse_args(argv)
     try:

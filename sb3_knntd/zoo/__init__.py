@@ -1,0 +1,7 @@
+"""RL Zoo's own commands, with ``knntd`` and ``exa`` beside its algorithms (extra ``[zoo]``)."""
+
+from __future__ import annotations
+
+from sb3_knntd.zoo.scripts import SCRIPTS, register, run
+
+__all__ = ["SCRIPTS", "register", "run"]

@@ -1,0 +1,81 @@
+"""RL Zoo's experiment, with what it does differently for this package's algorithms."""
+
+from __future__ import annotations
+
+import argparse
+from importlib.resources import files
+from typing import Any
+
+import optuna
+from gymnasium import spaces
+from rl_zoo3.exp_manager import ExperimentManager
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_knntd import KNNTD, ExA
+from sb3_knntd.zoo.schedules import with_schedules
+from sb3_knntd.zoo.search_space import OBS_DIM
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"knntd": KNNTD, "exa": ExA}
+
+#: What a table is made for. As with a network's architecture, training goes on with what the saved model has.
+SHAPE = ("points", "bounds", "action_points", "action_table")
+
+
+class KNNExperimentManager(ExperimentManager):
+    """
+    RL Zoo's experiment manager, which with an algorithm of this package
+
+    * takes its configuration from ``sb3_knntd.zoo_configs``,
+    * reads schedules of all its arguments (:mod:`sb3_knntd.zoo.schedules`),
+    * runs on the CPU, where the step is compiled, unless another device is named,
+    * goes on training (``-i``) with the points that the saved model has.
+
+    With the algorithms of RL Zoo it is RL Zoo's.
+
+    :param args: arguments of the command line, stored with the run
+    :param algo: name of the algorithm
+    :param arguments: RL Zoo's further ones, by position
+    :param options: RL Zoo's further ones, by name
+    """
+
+    def __init__(self, args: argparse.Namespace, algo: str, *arguments: Any, **options: Any) -> None:
+        self._is_ours = algo in ALGORITHMS
+        self.obs_dim = 0
+        if self._is_ours:
+            options["config"] = options.get("config") or str(files("sb3_knntd.zoo_configs") / f"{algo}.yml")
+            if options.get("device", "auto") == "auto":
+                options["device"] = "cpu"
+        super().__init__(args, algo, *arguments, **options)
+
+    # RL Zoo's is a static method; which schedules there are depends on the algorithm.
+    def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
+        return with_schedules(hyperparams) if self._is_ours else super()._preprocess_schedules(hyperparams)
+
+    def _preprocess_action_noise(
+        self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
+    ) -> dict[str, Any]:
+        # Here RL Zoo counts the actions for the search space.
+        if isinstance(env.observation_space, spaces.Box):
+            self.obs_dim = env.observation_space.shape[0]
+        return super()._preprocess_action_noise(hyperparams, saved_hyperparams, env)
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self._is_ours:
+            given = [name for name in SHAPE if name in (self.custom_hyperparams or {})]
+            if given:
+                raise ValueError(
+                    f"{' and '.join(given)} cannot be given with -i: training goes on with the table of "
+                    f"{self.trained_agent}. Train a new agent without -i"
+                )
+            hyperparams = {name: value for name, value in hyperparams.items() if name not in SHAPE}
+        return super()._load_pretrained_agent(hyperparams, env)
+
+    def objective(self, trial: optuna.Trial) -> float:
+        """
+        :param trial: trial of a study
+        :return: mean return of the last evaluation
+        """
+        if self._is_ours:
+            trial.set_user_attr(OBS_DIM, self.obs_dim)
+        return super().objective(trial)

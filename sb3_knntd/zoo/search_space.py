@@ -1,0 +1,128 @@
+"""
+What ``train --optimize`` searches: for each algorithm a sampler, and a converter from a study's values to arguments.
+
+A study holds plain numbers and words. Most are on a log scale: 1 - γ and 1 - λ rather than γ and λ, points in a
+dimension, and the bandwidth in spacings of the lattice, so that it means the same on any lattice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import optuna
+
+from sb3_knntd.zoo.schedules import with_schedules
+
+Params = dict[str, Any]
+Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], Params]
+
+#: Attribute of a trial: number of observation dimensions, 0 for finite states, which have no lattice.
+OBS_DIM = "obs_dim"
+
+#: Lattices are searched up to about so many points in all, with at most so many in a dimension.
+MOST_POINTS = 20_000
+MOST_POINTS_PER_DIMENSION = 40
+
+
+def sample_knntd_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    :param trial: trial with the user attribute ``"obs_dim"``
+    :param n_actions: not used
+    :param n_envs: not used
+    :param additional_args: not used
+    :return: arguments of :class:`~sb3_knntd.KNNTD`
+    """
+    params = _sample_common(trial)
+    params["target"] = trial.suggest_categorical("target", ["sarsa", "q_learning", "expected_sarsa"])
+    params["exploration"] = trial.suggest_categorical("exploration", ["epsilon_greedy", "softmax"])
+    params["exploration_initial_eps"] = trial.suggest_float("exploration_initial_eps", 0.01, 1.0, log=True)
+    params["exploration_fraction"] = trial.suggest_float("exploration_fraction", 0.1, 1.0)
+    params["initial_temperature"] = trial.suggest_float("initial_temperature", 0.01, 100.0, log=True)
+    return _arguments(trial, convert_knntd_params(params))
+
+
+def convert_knntd_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: values of a study of :class:`~sb3_knntd.KNNTD`
+    :return: arguments as a configuration has them
+    """
+    params = _convert_common(sampled_params)
+    # Softmax is to end near greedy, as ε-greedy does.
+    temperature = params.pop("initial_temperature")
+    params["temperature"] = f"lin_{temperature}_{temperature / 100}"
+    return params
+
+
+def sample_exa_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    :param trial: trial with the user attribute ``"obs_dim"``
+    :param n_actions: not used
+    :param n_envs: not used
+    :param additional_args: not used
+    :return: arguments of :class:`~sb3_knntd.ExA`
+    """
+    params = _sample_common(trial)
+    params["action_points"] = trial.suggest_int("action_points", 2, 15, log=True)
+    params["exploration"] = trial.suggest_categorical("exploration", ["shared", "per_neighbor"])
+    params["exploration_hold"] = trial.suggest_float("exploration_hold", 1.0, 50.0, log=True)
+    params["exploration_initial_eps"] = trial.suggest_float("exploration_initial_eps", 0.05, 1.0, log=True)
+    params["exploration_fraction"] = trial.suggest_float("exploration_fraction", 0.1, 1.0)
+    return _arguments(trial, convert_exa_params(params))
+
+
+def convert_exa_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: values of a study of :class:`~sb3_knntd.ExA`
+    :return: arguments as a configuration has them
+    """
+    return _convert_common(sampled_params)
+
+
+def _sample_common(trial: optuna.Trial) -> Params:
+    """What both algorithms have. Every value is asked for in every trial, as multivariate samplers need it."""
+    params: Params = {
+        "initial_learning_rate": trial.suggest_float("initial_learning_rate", 0.05, 1.0, log=True),
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True),
+        "one_minus_trace_decay": trial.suggest_float("one_minus_trace_decay", 0.01, 1.0, log=True),
+        "traces": trial.suggest_categorical("traces", ["replacing", "accumulating"]),
+        "initial_value_sign": trial.suggest_categorical("initial_value_sign", [-1, 0, 1]),
+        "initial_value_size": trial.suggest_float("initial_value_size", 0.1, 1000.0, log=True),
+    }
+    obs_dim: int = trial.user_attrs[OBS_DIM]
+    if obs_dim:
+        most = max(3, min(MOST_POINTS_PER_DIMENSION, int(MOST_POINTS ** (1 / obs_dim))))
+        fewest = min(5, most - 1)
+        params["points_per_dimension"] = trial.suggest_int("points_per_dimension", fewest, most, log=True)
+        params["n_neighbors"] = trial.suggest_int("n_neighbors", 1, min(8 * obs_dim, fewest**obs_dim), log=True)
+        params["weights"] = trial.suggest_categorical("weights", ["inverse_quadratic", "gaussian"])
+        params["bandwidth_in_spacings"] = trial.suggest_float("bandwidth_in_spacings", 0.5, 10.0, log=True)
+    return params
+
+
+def _convert_common(sampled_params: Params) -> Params:
+    params = dict(sampled_params)
+    params["learning_rate"] = f"lin_{params.pop('initial_learning_rate')}"
+    params["gamma"] = 1 - params.pop("one_minus_gamma")
+    params["trace_decay"] = 1 - params.pop("one_minus_trace_decay")
+    params["initial_value"] = params.pop("initial_value_sign") * params.pop("initial_value_size")
+    if "points_per_dimension" in params:
+        params["points"] = params.pop("points_per_dimension")
+        # In scaled units a lattice is 2 wide.
+        params["bandwidth"] = params.pop("bandwidth_in_spacings") * 2 / (params["points"] - 1)
+    return params
+
+
+def _arguments(trial: optuna.Trial, params: Params) -> Params:
+    """Arguments ready to use. Those a study has in another form are stored with the trial, to be read."""
+    for name in params.keys() - trial.params.keys():
+        trial.set_user_attr(name, params[name])
+    return with_schedules(params)
+
+
+SAMPLERS: dict[str, Sampler] = {"knntd": sample_knntd_params, "exa": sample_exa_params}
+CONVERTERS: dict[str, Callable[[Params], Params]] = {"knntd": convert_knntd_params, "exa": convert_exa_params}
