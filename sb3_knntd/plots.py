@@ -298,7 +298,7 @@ def plot_visits(counts: np.ndarray, extent: tuple[float, float, float, float], a
         origin="lower",
         extent=extent,
         aspect="auto",
-        cmap="magma",
+        cmap="magma_r",
         norm=LogNorm(1, max(10, int(counts.max()))),
         interpolation="nearest",
     )
@@ -321,13 +321,16 @@ def plot_routes(routes: Sequence[np.ndarray], dims: tuple[int, int], axes: Axes)
     from matplotlib.patheffects import withStroke
 
     range_x, range_y = axes.get_xlim(), axes.get_ylim()
+    edge = [withStroke(linewidth=2.4, foreground="black")]
     for age, route in enumerate(reversed(routes)):
         x, y = route[:, dims[0]], route[:, dims[1]]
-        shade = {"color": "white", "alpha": max(0.35, 1.0 - 0.3 * age), "zorder": 3 - 0.01 * age}
-        edge = [withStroke(linewidth=2.4, foreground="black")]
-        axes.plot(x, y, linewidth=1.1, path_effects=edge, **shade)
-        axes.plot(x[:1], y[:1], "o", markersize=6, markeredgecolor="black", **shade)
-        axes.plot(x[-1:], y[-1:], "X", markersize=8, markeredgecolor="black", **shade)
+        lines = [
+            *axes.plot(x, y, linewidth=1.1, path_effects=edge),
+            *axes.plot(x[:1], y[:1], "o", markersize=6, markeredgecolor="black"),
+            *axes.plot(x[-1:], y[-1:], "X", markersize=8, markeredgecolor="black"),
+        ]
+        for line in lines:
+            line.set(color="white", alpha=max(0.35, 1.0 - 0.3 * age), zorder=3 - 0.01 * age)
     axes.set(xlim=range_x, ylim=range_y)
     return axes
 
@@ -395,7 +398,9 @@ def figure_of(axes: Axes) -> Figure:
 def _draw_values(axes: Axes, grid: ValueGrid) -> None:
     values = np.ma.masked_where(~grid.learned, grid.values)
     image = axes.imshow(values, origin="lower", extent=grid.extent, aspect="auto", cmap="viridis")
-    figure_of(axes).colorbar(image, ax=axes, label=r"$V(s) = \max_a\,Q(s, a)$")
+    # ExA's is the mean of the neighbours' best values.
+    label = r"$V(s) = \max_a\,Q(s, a)$" if grid.actions.ndim == 2 else "$V(s)$"
+    figure_of(axes).colorbar(image, ax=axes, label=label)
     axes.set_title("Value")
 
 
@@ -497,7 +502,8 @@ def _places(low: np.ndarray, high: np.ndarray, averaged: tuple[int, ...]) -> np.
 
     dims = list(averaged)
     spread: np.ndarray = qmc.Halton(len(dims), scramble=False).random(AVERAGED_PLACES + 1)[1:]
-    return low[dims] + spread * (high[dims] - low[dims])
+    places: np.ndarray = low[dims] + spread * (high[dims] - low[dims])
+    return places
 
 
 def _join(readings: Sequence[_Reading], n_actions: int) -> _Reading:
@@ -505,16 +511,15 @@ def _join(readings: Sequence[_Reading], n_actions: int) -> _Reading:
     if len(readings) == 1:
         return readings[0]
     q_values, values, actions, learned = (np.stack(part) for part in zip(*readings, strict=True))
-    counts = (learned | ~learned.any(axis=0)).astype(np.float64)
+    anywhere = np.asarray(learned.any(axis=0))
+    counts = (learned | ~anywhere).astype(np.float64)
     counts /= counts.sum(axis=0)
     if actions.ndim == 2:
         shares = np.stack([(counts * (actions == action)).sum(axis=0) for action in range(n_actions)])
         joined = shares.argmax(axis=0)
     else:
         joined = (counts[..., None] * actions).sum(axis=0)
-    return _Reading(
-        (counts[..., None] * q_values).sum(axis=0), (counts * values).sum(axis=0), joined, learned.any(axis=0)
-    )
+    return _Reading((counts[..., None] * q_values).sum(axis=0), (counts * values).sum(axis=0), joined, anywhere)
 
 
 def _range(model: KNNAlgorithm) -> tuple[np.ndarray, np.ndarray]:

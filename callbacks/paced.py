@@ -1,0 +1,93 @@
+"""When to do what takes longer than a step."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import CSVOutputFormat, HumanOutputFormat, JSONOutputFormat, KVWriter, Logger
+
+from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.checks import check_integer
+
+
+class PacedCallback(BaseCallback):
+    """
+    Acts now and then, and when training ends.
+
+    :param name: name of the argument that ``freq`` was given as
+    :param freq: act every ``freq`` calls (of n_envs steps each); ``None``: as often as takes half a percent of the time
+    :param verbose: 0 for no output, 1 for a line whenever a file is written
+    :raises ValueError: if ``freq`` is neither ``None`` nor an integer >= 1
+    """
+
+    model: KNNAlgorithm
+
+    #: ``freq=None``: the share of the time that is spent on acting.
+    SHARE: ClassVar[float] = 0.005
+    #: Seconds that the first act is taken to last.
+    FIRST_SECONDS: ClassVar[float]
+
+    def __init__(self, name: str, freq: int | None, verbose: int) -> None:
+        super().__init__(verbose)
+        self.freq = None if freq is None else check_integer(name, freq, 1)
+
+    def init_callback(self, model: Any) -> None:
+        """
+        :param model: the model that is about to learn
+        :raises ValueError: if it is none of this package
+        """
+        if not isinstance(model, KNNAlgorithm):
+            raise ValueError(f"{type(self).__name__} looks into KNNTD and ExA; got a {type(model).__name__}")
+        super().init_callback(model)
+
+    def _on_training_start(self) -> None:
+        self._acted_at = self.n_calls
+        self._seconds = self.FIRST_SECONDS
+        self._rested_since = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        if self.freq is None:
+            due = (time.perf_counter() - self._rested_since) * self.SHARE >= self._seconds
+        else:
+            due = self.n_calls % self.freq == 0
+        if due:
+            start = time.perf_counter()
+            self._acted_at = self.n_calls
+            self._act()
+            self._rested_since = time.perf_counter()
+            self._seconds = self._rested_since - start
+        return True
+
+    def _on_training_end(self) -> None:
+        if self.n_calls > self._acted_at:
+            self._acted_at = self.n_calls
+            self._act()
+
+    @abstractmethod
+    def _act(self) -> None:
+        """Do what takes longer than a step."""
+
+
+def picture_formats(logger: Logger) -> list[KVWriter]:
+    """
+    :param logger: SB3's
+    :return: those of its outputs that take more than text: TensorBoard, and what others have made
+    """
+    text = HumanOutputFormat, JSONOutputFormat, CSVOutputFormat
+    return [output for output in logger.output_formats if not isinstance(output, text)]
+
+
+def write(outputs: list[KVWriter], key: str, value: Any, step: int) -> None:
+    """
+    Write one value at once, in place of when the algorithm next does: it is what is true at this step.
+
+    :param outputs: of :func:`picture_formats`
+    :param key: the name it is shown under
+    :param value: a number, or SB3's ``Image`` or ``HParam``
+    :param step: number of environment steps
+    """
+    for output in outputs:
+        output.write({key: value}, {key: ()}, step)

@@ -1,0 +1,231 @@
+"""Checkpoints that survive a crash, and what goes on from them."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import secrets
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.checks import check_integer
+
+from .paced import PacedCallback
+
+#: What a checkpoint has besides the model: a dict of the classes and the best mean return, and what wrappers saved.
+NOTES = "checkpoint.pkl"
+WRAPPER = "vec_env_wrapper_{}.pkl"
+
+
+class TableCheckpointCallback(PacedCallback):
+    """
+    Saves the model, with the statistics of VecNormalize and of any other VecEnvWrapper that has ``save`` and ``load``
+    as it has, when training ends, and before that every ``save_freq`` calls. The last ones and the best are kept:
+    ``{name_prefix}_{steps}_steps.zip`` and ``{name_prefix}_best.zip``. The best is the one with the highest mean
+    return of the last training episodes (``rollout/ep_rew_mean``, over ``stats_window_size`` episodes) when it was
+    saved; for the best of evaluations there is SB3's EvalCallback.
+
+    Each is one file, written beside and renamed when it is whole: whatever stops the process, even the machine, the
+    newest checkpoint is whole. It is a model as ``KNNTD.load`` takes it, too.
+
+    .. code-block:: python
+
+        model.learn(1_000_000, callback=TableCheckpointCallback("checkpoints"))
+
+        # after a crash
+        model = TableCheckpointCallback.resume("checkpoints", env)
+        callback = TableCheckpointCallback("checkpoints")
+        model.learn(1_000_000 - model.num_timesteps, callback=callback, reset_num_timesteps=False)
+
+    :param save_path: folder
+    :param save_freq: save every so many calls (of n_envs steps each); ``None``: as often as takes half a percent of
+        the time, which is every ten seconds or so with a small table
+    :param n_last: how many of the last are kept, >= 1
+    :param save_best: whether to keep the best
+    :param name_prefix: what the files' names begin with
+    :param verbose: 1 for a line whenever a file is written
+    :raises ValueError: if an argument does not fit; when training begins, if the folder holds checkpoints of later
+        steps, which are those of another run
+    """
+
+    FIRST_SECONDS: ClassVar[float] = 0.05
+
+    def __init__(
+        self,
+        save_path: str | Path,
+        save_freq: int | None = None,
+        n_last: int = 3,
+        save_best: bool = True,
+        name_prefix: str = "checkpoint",
+        verbose: int = 0,
+    ) -> None:
+        super().__init__("save_freq", save_freq, verbose)
+        self.save_path = Path(save_path)
+        self.n_last = check_integer("n_last", n_last, 1)
+        self.save_best = save_best
+        self.name_prefix = name_prefix
+        #: mean return of the best so far, ``None`` before there is one
+        self.best_mean_reward: float | None = None
+
+    @property
+    def best_path(self) -> Path:
+        """Where the best is."""
+        return self.save_path / f"{self.name_prefix}_best.zip"
+
+    def _init_callback(self) -> None:
+        self.save_path.mkdir(parents=True, exist_ok=True)
+        # What a crash left half written.
+        for part in self.save_path.glob(f".{self.name_prefix}_*.part"):
+            part.unlink()
+
+    def _on_training_start(self) -> None:
+        steps = _steps_of(self.save_path, self.name_prefix)
+        if steps and max(steps) > self.num_timesteps:
+            raise ValueError(
+                f"save_path: {self.save_path} holds a checkpoint of step {max(steps)}, and this run is at step "
+                f"{self.num_timesteps}. To go on from it call TableCheckpointCallback.resume({str(self.save_path)!r}, "
+                "env) and learn(..., reset_num_timesteps=False); for a new run give another folder or name_prefix"
+            )
+        if self.save_best and self.best_path.exists():
+            self.best_mean_reward = _read_notes(self.best_path)["mean_reward"]
+        super()._on_training_start()
+
+    def _act(self) -> None:
+        path = _path_of(self.save_path, self.name_prefix, self.num_timesteps)
+        episodes = self.model.ep_info_buffer
+        mean_reward = float(safe_mean([episode["r"] for episode in episodes])) if episodes else None
+        _write_whole(path, lambda file: _save(file, self.model, mean_reward))
+        best = self.best_mean_reward
+        if self.save_best and mean_reward is not None and (best is None or mean_reward > best):
+            with open(path, "rb") as saved:
+                _write_whole(self.best_path, lambda file: shutil.copyfileobj(saved, file))
+            self.best_mean_reward = mean_reward
+        for step in _steps_of(self.save_path, self.name_prefix)[: -self.n_last]:
+            _path_of(self.save_path, self.name_prefix, step).unlink()
+        if self.verbose >= 1:
+            print(f"Checkpoint written to {path}")
+
+    @staticmethod
+    def resume(
+        path: str | Path,
+        env: GymEnv | str,
+        name_prefix: str = "checkpoint",
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> KNNAlgorithm:
+        """
+        The model of the newest checkpoint, with its environment as it was wrapped then. Go on with
+        ``model.learn(remaining_steps, reset_num_timesteps=False)``.
+
+        A wrapper that was saved takes the place of one of its class around ``env``; if there is none, it is put around
+        ``env``. So ``env`` may be what the first run's script makes, or what that wraps.
+
+        :param path: folder, or one checkpoint, such as the best
+        :param env: the environment to go on in
+        :param name_prefix: what the files' names begin with
+        :param force_reset: whether new episodes begin. ``False`` is for an environment that is still in the state it
+            was in: learning then goes on as if it had not been interrupted, to the bit
+        :param kwargs: other arguments of :meth:`~sb3_knntd.KNNTD.load`
+        :return: the model; its environment is ``model.get_env()``
+        :raises FileNotFoundError: if there is no checkpoint
+        :raises ValueError: if the file is damaged or no checkpoint, or ``env`` has other spaces
+        """
+        file = Path(path)
+        if not file.is_file():
+            steps = _steps_of(file, name_prefix)
+            if not steps:
+                raise FileNotFoundError(f"no checkpoint {name_prefix}_*_steps.zip in {file}")
+            file = _path_of(file, name_prefix, steps[-1])
+        notes = _read_notes(file)
+        venv = KNNAlgorithm._wrap_env(maybe_make_env(env, verbose=0), verbose=0)
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(file) as archive:
+            # From the inside out, as each is put around what is there by then.
+            for index, wrapper in reversed(list(enumerate(notes["wrappers"]))):
+                venv = _rewrap(venv, wrapper, archive.extract(WRAPPER.format(index), folder))
+        model: KNNAlgorithm = notes["algorithm"].load(file, env=venv, force_reset=force_reset, **kwargs)
+        return model
+
+
+def _path_of(folder: Path, name_prefix: str, step: int) -> Path:
+    return folder / f"{name_prefix}_{step}_steps.zip"
+
+
+def _steps_of(folder: Path, name_prefix: str) -> list[int]:
+    """The steps that there are checkpoints of, rising."""
+    prefix, suffix = f"{name_prefix}_", "_steps.zip"
+    names = (path.name for path in folder.glob("*.zip"))
+    numbers = (name[len(prefix) : -len(suffix)] for name in names if name.startswith(prefix) and name.endswith(suffix))
+    return sorted(int(number) for number in numbers if number.isdecimal())
+
+
+def _save(file: IO[bytes], model: KNNAlgorithm, mean_reward: float | None) -> None:
+    model.save(file)  # type: ignore[arg-type]
+    wrappers = _saveable_wrappers(model.get_env())
+    notes = {"algorithm": type(model), "wrappers": [type(w) for w in wrappers], "mean_reward": mean_reward}
+    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(file, "a") as archive:
+        archive.writestr(NOTES, pickle.dumps(notes))
+        for index, wrapper in enumerate(wrappers):
+            saved = os.path.join(folder, WRAPPER.format(index))
+            wrapper.save(saved)
+            archive.write(saved, WRAPPER.format(index))
+
+
+def _saveable_wrappers(venv: VecEnv | None) -> list[Any]:
+    """Those that can be saved and loaded as VecNormalize can, from the outside in."""
+    wrappers = []
+    while isinstance(venv, VecEnvWrapper):
+        # On the class, as wrappers hand on what they do not have to what they wrap.
+        if all(callable(getattr(type(venv), name, None)) for name in ("save", "load")):
+            wrappers.append(venv)
+        venv = venv.venv
+    return wrappers
+
+
+def _rewrap(venv: VecEnv, wrapper: type[Any], saved: str) -> VecEnv:
+    """Load a wrapper from where it was saved, in the place of that of its class, or around everything."""
+    around: list[VecEnvWrapper] = []
+    inner = venv
+    while isinstance(inner, VecEnvWrapper) and type(inner) is not wrapper:
+        around.append(inner)
+        inner = inner.venv
+    if not isinstance(inner, VecEnvWrapper):
+        loaded: VecEnv = wrapper.load(saved, venv)
+        return loaded
+    loaded = wrapper.load(saved, inner.venv)
+    if not around:
+        return loaded
+    around[-1].venv = loaded
+    return venv
+
+
+def _write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
+    """Write a file beside, and give it its name when it is whole and on the disk."""
+    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    try:
+        with open(part, "x+b") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _read_notes(path: Path) -> dict[str, Any]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            notes: dict[str, Any] = pickle.loads(archive.read(NOTES))
+    except (zipfile.BadZipFile, KeyError, EOFError) as error:
+        raise ValueError(f"{path} is no checkpoint, or was cut off: {error}") from error
+    return notes

@@ -1,0 +1,175 @@
+"""What was learned, as a picture."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from stable_baselines3.common.logger import Image
+
+from sb3_knntd.checks import check_integer
+from sb3_knntd.plots import (
+    Names,
+    caption_of,
+    count_panels,
+    names_for,
+    new_figure,
+    plot_routes,
+    plot_value_function,
+    plot_visits,
+    value_grid,
+)
+
+from .footprints import Footprints, last_observation
+from .paced import PacedCallback, picture_formats, write
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Dots per inch. A finer picture takes longer to draw, and TensorBoard shows it no larger.
+DPI = 100
+#: Panels beside each other; an action of many dimensions goes on below.
+COLUMNS = 3
+
+
+class ValueMapCallback(PacedCallback):
+    """
+    Draws over two dimensions of the observations: the value V(s) = max_a Q(s, a) with the ways that the last episodes
+    of the first environment took, the greedy action, and how often each place was visited since training began (how
+    many steps of all environments led there). A picture is drawn when training ends, and before that every
+    ``draw_freq`` calls.
+
+    Pictures go to TensorBoard's images under ``map/value``, if the model logs there, and to ``folder``, if one is
+    given.
+
+    .. code-block:: python
+
+        model = KNNTD("MountainCar-v0", tensorboard_log="logs")
+        model.learn(50_000, callback=ValueMapCallback(draw_freq=10_000))
+
+    :param dims: the two dimensions, horizontal and vertical
+    :param fixed: where to hold other dimensions, observation units (with VecNormalize the normalised ones)
+    :param average: what is done with the dimensions that ``fixed`` does not name: held in the middle of their range,
+        or averaged over, see :func:`~sb3_knntd.plots.value_grid`
+    :param draw_freq: draw every so many calls (of n_envs steps each); ``None``: as often as takes half a percent of
+        the time, which is once in a minute or so
+    :param n_routes: how many episodes are drawn, the last ones
+    :param resolution: number of cells in each of the two dimensions
+    :param folder: where to write ``value_map_{steps}.png``; ``None`` for no files
+    :param names: what dimensions and actions are called; ``None`` for what is known of the environment
+    :param verbose: 1 for a line whenever a file is written
+    :raises ValueError: if an argument does not fit; when training begins, if the observations are not a Box of two or
+        more dimensions, ``dims``, ``fixed`` or ``names`` do not fit them, or pictures have nowhere to go
+    """
+
+    FIRST_SECONDS: ClassVar[float] = 0.4
+
+    def __init__(
+        self,
+        dims: tuple[int, int] = (0, 1),
+        fixed: Mapping[int, float] | None = None,
+        average: bool = False,
+        draw_freq: int | None = None,
+        n_routes: int = 3,
+        resolution: int = 60,
+        folder: str | Path | None = None,
+        names: Names | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__("draw_freq", draw_freq, verbose)
+        self.dims = dims
+        self.fixed = fixed
+        self.average = average
+        self.n_routes = check_integer("n_routes", n_routes, 0)
+        self.resolution = check_integer("resolution", resolution, 1)
+        self.folder = None if folder is None else Path(folder)
+        self.names = names
+        self._footprints: Footprints | None = None
+
+    def _init_callback(self) -> None:
+        # What does not fit is to be known before hours of training.
+        value_grid(self.model, self.dims, self.fixed, 1, self.average)
+        names_for(self.model, self.names)
+        new_figure(1.0, 1.0)
+        if self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        self._footprints = Footprints(self.dims, self.resolution, self.n_routes)
+
+    def _on_training_start(self) -> None:
+        if self.folder is None and not picture_formats(self.logger):
+            raise ValueError(
+                "ValueMapCallback: the pictures have nowhere to go. Give the model tensorboard_log, or the callback "
+                "folder='pictures'"
+            )
+        assert isinstance(self.model._last_obs, np.ndarray)
+        assert self._footprints is not None
+        self._footprints.begin(self.model._last_obs)
+        super()._on_training_start()
+
+    def _on_step(self) -> bool:
+        footprints, observations = self._footprints, self.locals["new_obs"]
+        assert footprints is not None
+        if self.locals["dones"][0]:
+            footprints.end_route(last_observation(self.locals["infos"], observations))
+        footprints.add(observations)
+        if footprints.is_full:
+            footprints.count(self._extent())
+        return super()._on_step()
+
+    def _on_training_end(self) -> None:
+        super()._on_training_end()
+        assert self._footprints is not None
+        self._footprints.count(self._extent())
+
+    def _extent(self) -> tuple[float, float, float, float]:
+        bounds = self.model.policy.perceiver.bounds
+        low, high = bounds.low.tolist(), bounds.high.tolist()
+        across, up = self.dims
+        return low[across], high[across], low[up], high[up]
+
+    def _act(self) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        canvas = FigureCanvasAgg(self.draw())
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+        write(picture_formats(self.logger), "map/value", Image(pixels, "HWC"), self.num_timesteps)
+        if self.folder is not None:
+            from matplotlib.image import imsave
+
+            path = self.folder / f"value_map_{self.num_timesteps}.png"
+            imsave(path, pixels)
+            if self.verbose >= 1:
+                print(f"Value map written to {path}")
+
+    def draw(self) -> Figure:
+        """
+        :return: the picture as of now; save it with ``figure.savefig(path)``
+        """
+        footprints = self._footprints
+        assert footprints is not None
+        footprints.count(self._extent())
+        names = names_for(self.model, self.names)
+        n_panels = count_panels(self.model) + 1
+        n_rows = -(-n_panels // COLUMNS)
+        figure = new_figure(4.6 * COLUMNS, 4.2 * n_rows)
+        figure.set_dpi(DPI)
+        panels = figure.subplots(n_rows, COLUMNS, sharex=True, sharey=True, squeeze=False).flatten().tolist()
+        for empty in panels[n_panels:]:
+            empty.set_axis_off()
+        value_axes, *_ = plot_value_function(
+            self.model, self.dims, self.fixed, self.resolution, panels[: n_panels - 1], names, self.average
+        )
+        visits = plot_visits(footprints.counts, self._extent(), panels[n_panels - 1])
+        visits.set_xlabel(names.observations[self.dims[0]])
+        plot_routes(list(footprints.routes), self.dims, value_axes)
+        notes = [f"step {self.num_timesteps:,}"]
+        if footprints.routes:
+            n_routes = len(footprints.routes)
+            notes.append(f"lines: the last {f'{n_routes} episodes' if n_routes > 1 else 'episode'}")
+        notes.append(caption_of(value_grid(self.model, self.dims, self.fixed, 1, self.average), names))
+        figure.suptitle(textwrap.fill("; ".join(filter(None, notes)), 150), fontsize="medium", color="0.3")
+        return figure
