@@ -546,7 +546,7 @@ class KNNAlgorithm(BaseAlgorithm):
         :param print_system_info: whether to print the system it was saved on
         :param force_reset: whether ``learn`` starts new episodes; ``False`` goes on in the middle of the saved
             ones, for an environment that is in the state it was in
-        :param kwargs: attributes to change
+        :param kwargs: attributes to change; with ``seed`` the random numbers begin anew
         :return: the model
         :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has
         """
@@ -559,8 +559,10 @@ class KNNAlgorithm(BaseAlgorithm):
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         if model.n_envs != saved["n_envs"]:
             model._last_obs = model._last_actions = None
-        for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
-            stream.set_state(state)
+        # A seed that is given begins new sequences, none goes on with those saved.
+        if kwargs.get("seed") is None:
+            for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
+                stream.set_state(state)
         return model
 
 
