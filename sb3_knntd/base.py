@@ -287,7 +287,7 @@ class KNNAlgorithm(BaseAlgorithm):
         uniforms = th.from_numpy(np.stack([self._prediction_stream.next() for _ in range(len(rows))]))
         uniforms, rate = uniforms.to(rows.device), self.exploration_rate
         nothing = th.full((len(rows), len(self._rule.blocks) - 1), UNDRAWN, device=rows.device)
-        held = self._rule.hold(nothing, uniforms, rate)
+        held = self._rule.hold(nothing, uniforms, rate, th.zeros(len(rows), device=rows.device))
         choice = self._rule.choose(rows, probabilities, uniforms, rate, held)
         return self._env_actions(choice.actions.cpu().numpy()).reshape(greedy.shape), state
 

@@ -42,6 +42,7 @@ class CompiledLearner(Learner):
         n_blocks = len(rule.blocks) - 1
         self._entries = np.zeros((3, n_envs, k, n_blocks), np.int64)
         self._held = np.full((n_envs, n_blocks), kernel.UNDRAWN)
+        self._lengths = np.zeros(1 + n_envs)
         actions = np.zeros((3, n_envs, self._rule[-1].shape[1]))
         # One action for all neighbours is the column that the first answers for.
         averages = self._rule[0] == kernel.AVERAGE
@@ -56,6 +57,7 @@ class CompiledLearner(Learner):
             self._truncated,
             self._last_observations,
             self._held,
+            self._lengths,
         )
         self._sums = np.zeros(2)
         self._n_sums = 0
@@ -133,6 +135,7 @@ class CompiledLearner(Learner):
             "probabilities": th.from_numpy(self._probabilities[kernel.NOW].copy()),
             "entries": th.from_numpy(self._entries[kernel.NOW].copy()),
             "held": th.from_numpy(self._held.copy()),
+            "lengths": th.from_numpy(self._lengths.copy()),
             "traces": self.live.state(),
         }
 
@@ -143,6 +146,7 @@ class CompiledLearner(Learner):
             self._probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
             self._entries[kernel.NOW] = state_dict["entries"].numpy()
             self._held[:] = state_dict["held"].numpy()
+            self._lengths[:] = state_dict["lengths"].numpy()
             self.live.set_state(state_dict["traces"])
         self._set_desk()
 

@@ -17,6 +17,10 @@ from sb3_knntd.checks import check_number, check_word
 from sb3_knntd.policies import ExAPolicy
 from sb3_knntd.rules import ActionRule, ContinuousRule
 
+#: ``exploration_hold="auto"``: what share of an episode. A pole falls within fifty steps if something is tried for
+#: longer, and a car leaves no valley on less.
+AUTO_HOLD = 1 / 50
+
 SelfExA = TypeVar("SelfExA", bound="ExA")
 
 
@@ -48,7 +52,8 @@ class ExA(KNNAlgorithm):
     :param exploration_initial_eps: ε at the start, in [0, 1]: with ``"shared"`` the share of the time spent exploring
     :param exploration_final_eps: ε at the end, in [0, 1]
     :param exploration_fraction: share of the training over which ε changes, in (0, 1]
-    :param exploration_hold: for how many steps in the mean, >= 1, a shared draw of whether and what to explore is held
+    :param exploration_hold: for how many steps in the mean, >= 1, a shared draw of whether and what to explore is
+        held; ``"auto"`` is a fiftieth of an episode, as long as episodes are at present
     :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
     """
 
@@ -79,7 +84,7 @@ class ExA(KNNAlgorithm):
         exploration_initial_eps: float = 0.9,
         exploration_final_eps: float = 0.0,
         exploration_fraction: float = 1.0,
-        exploration_hold: float = 5.0,
+        exploration_hold: float | str = "auto",
         tie_break: str = "random",
         initial_value: float = 0.0,
         stats_window_size: int = 100,
@@ -140,14 +145,26 @@ class ExA(KNNAlgorithm):
     def _make_rule(self) -> ActionRule:
         check_word("exploration", self.exploration, ["shared", "per_neighbor"])
         columns = self.policy.columns
+        least_hold, hold_share = self._hold()
         return ContinuousRule(
             columns.points,
             columns.blocks,
             self.exploration == "shared",
-            check_number("exploration_hold", self.exploration_hold, 1.0),
+            least_hold,
+            hold_share,
             self.policy.n_neighbors,
             self.tie_break == "random",
         )
+
+    def _hold(self) -> tuple[float, float]:
+        """For how many steps a draw is held at least, and for what share of an episode."""
+        if not isinstance(self.exploration_hold, str):
+            return check_number("exploration_hold", self.exploration_hold, 1.0), 0.0
+        if self.exploration_hold != "auto":
+            raise ValueError(
+                f"exploration_hold must be a finite number in [1, inf), or 'auto'; got {self.exploration_hold!r}"
+            )
+        return 1.0, AUTO_HOLD
 
     def _make_exploration_schedule(self) -> Schedule:
         return self._make_epsilon_schedule()

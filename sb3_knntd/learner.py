@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
-from sb3_knntd.kernels.step import UNDRAWN
+from sb3_knntd.kernels.step import UNDRAWN, count_steps
 from sb3_knntd.memory import DenseTable, DenseTraces, OneStepTraces, Traces
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.rules import ActionRule, Choice
@@ -169,12 +169,15 @@ class TorchLearner(Learner):
         self.entries = th.zeros((*shape, n_blocks), dtype=th.int64, device=values.device)
         #: what each environment is exploring, see :meth:`~sb3_knntd.rules.ActionRule.hold`
         self.held = th.full((n_envs, n_blocks), UNDRAWN, dtype=th.int64, device=values.device)
+        #: see :func:`~sb3_knntd.kernels.step.count_steps`; on the CPU, where it is known which episodes ended
+        self.lengths = np.zeros(1 + n_envs)
         self._sums = values.new_zeros(2)
         self._n_sums = 0
 
     def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
         check_finite("an observation", observations, range(self.n_envs))
         self.traces.clear()
+        self.lengths[1:] = 0.0
         self._hold(UNDRAWN, uniforms, rate)
         perception, choice = self._choose(observations, uniforms, rate, self.held)
         return self._settle_in(perception, choice)
@@ -190,6 +193,7 @@ class TorchLearner(Learner):
         rates: Rates,
     ) -> np.ndarray:
         check_transition(observations, rewards)
+        count_steps(self.lengths, ended)
         held, over = self.held, self._tensor(ended)
         self._hold(th.where(over[:, None], UNDRAWN, held), uniforms[:, 0], rates[2])
         perception, choice = self._choose(observations, uniforms[:, 0], rates[2], self.held)
@@ -229,6 +233,7 @@ class TorchLearner(Learner):
             "probabilities": self.probabilities.double().cpu(),
             "entries": self.entries.cpu(),
             "held": self.held.cpu(),
+            "lengths": th.from_numpy(self.lengths.copy()),
             "traces": self.traces.state(),
         }
 
@@ -238,11 +243,13 @@ class TorchLearner(Learner):
             return
         for name in ("indices", "probabilities", "entries", "held"):
             getattr(self, name).copy_(state_dict[name])
+        self.lengths[:] = state_dict["lengths"].numpy()
         self.traces.set_state(state_dict["traces"])
 
     def _hold(self, held: th.Tensor | int, uniforms: np.ndarray, rate: float) -> None:
         start = held if isinstance(held, th.Tensor) else th.full_like(self.held, held)
-        self.held = self.rule.hold(start, self._tensor(uniforms), rate)
+        lengths = self._tensor(np.maximum(self.lengths[0], self.lengths[1:]))
+        self.held = self.rule.hold(start, self._tensor(uniforms), rate, lengths)
 
     def _choose(
         self, observations: np.ndarray, uniforms: np.ndarray, rate: float, held: th.Tensor

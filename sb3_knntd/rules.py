@@ -49,13 +49,14 @@ class ActionRule(ABC):
     blocks: np.ndarray
 
     @abstractmethod
-    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float) -> th.Tensor:
+    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
         """
         What is being explored, now that a step has passed.
 
         :param held: the columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (batch, n_blocks), int64
         :param uniforms: random numbers in [0, 1), shape (batch, n_uniforms)
         :param rate: ε or the temperature
+        :param lengths: how many steps each episode is taken to last, shape (batch,)
         :return: the same, shape (batch, n_blocks)
         """
 
@@ -135,9 +136,9 @@ class DiscreteRule(ActionRule):
     def kernel_arguments(self) -> tuple[Any, ...]:
         target = {"sarsa": SARSA, "q_learning": Q_LEARNING, "expected_sarsa": EXPECTED_SARSA}[self.target]
         exploration = SOFTMAX if isinstance(self.exploration, Softmax) else EPSILON_GREEDY
-        return AVERAGE, target, exploration, self.random_ties, 1.0, self.blocks, np.empty((0, 0))
+        return AVERAGE, target, exploration, self.random_ties, 1.0, 0.0, self.blocks, np.empty((0, 0))
 
-    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float) -> th.Tensor:
+    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
         return held
 
     def choose(
@@ -165,7 +166,8 @@ class ContinuousRule(ActionRule):
     :param action_points: the action of each column, shape (n_actions, action_dim), action units
     :param blocks: where the columns of each of the action's parts begin, and the end, shape (n_blocks + 1,)
     :param shared: whether all neighbours explore the same column together, or each by itself (eq. 27)
-    :param mean_hold: for how many steps in the mean a draw of whether and what to explore together is held
+    :param least_hold: for how many steps in the mean a draw of whether and what to explore together is held
+    :param hold_share: or for this share of an episode, if that is longer
     :param n_neighbors: k
     :param random_ties: whether equal best columns are drawn from while training
     """
@@ -175,14 +177,16 @@ class ContinuousRule(ActionRule):
         action_points: np.ndarray,
         blocks: np.ndarray,
         shared: bool,
-        mean_hold: float,
+        least_hold: float,
+        hold_share: float,
         n_neighbors: int,
         random_ties: bool,
     ) -> None:
         self.action_points = action_points
         self.blocks = blocks
         self.shared = shared
-        self.mean_hold = mean_hold
+        self.least_hold = float(least_hold)
+        self.hold_share = float(hold_share)
         self.random_ties = random_ties
         n_blocks = len(blocks) - 1
         #: redraw, explore, column of each block, tie of each neighbour and block, and whether each explores
@@ -191,9 +195,10 @@ class ContinuousRule(ActionRule):
 
     def kernel_arguments(self) -> tuple[Any, ...]:
         exploration = SHARED if self.shared else PER_NEIGHBOR
-        return EACH, SARSA, exploration, self.random_ties, self.mean_hold, self.blocks, self.action_points
+        hold = self.least_hold, self.hold_share
+        return EACH, SARSA, exploration, self.random_ties, *hold, self.blocks, self.action_points
 
-    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float) -> th.Tensor:
+    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
         if not self.shared:
             return held
         redraw, explore, columns, *_ = uniforms.split(self._parts, dim=1)
@@ -202,7 +207,8 @@ class ContinuousRule(ActionRule):
             for block, (first, end) in enumerate(pairwise(self.blocks.tolist()))
         ]
         fresh = th.where(explore < rate, th.stack(drawn, dim=1), GREEDY)
-        return th.where((held[:, :1] == UNDRAWN) | (redraw * self.mean_hold < 1.0), fresh, held)
+        steps = (self.hold_share * lengths).clamp(min=self.least_hold)
+        return th.where((held[:, :1] == UNDRAWN) | (redraw * steps[:, None] < 1.0), fresh, held)
 
     def choose(
         self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, held: th.Tensor

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import pathlib
 from collections.abc import Callable, Sequence
@@ -347,6 +348,33 @@ def test_shared_exploration_holds_a_column(learner: str, hold: float) -> None:
     assert changes == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / n))
 
 
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_by_itself_exploration_holds_for_a_fiftieth_of_an_episode(learner: str, n_envs: int) -> None:
+    """As many draws as expected, by what the lengths of the episodes so far say at each step."""
+    lengths, n_steps = (400, 30, 1200, 300), 4000
+    venv = RecordingVecEnv(make_venv(n_envs, lengths=lengths))
+    # Of so many columns hardly any is drawn twice in a row.
+    make_model(
+        venv, action_points=500, exploration_initial_eps=1.0, exploration_final_eps=1.0, exploration_hold="auto",
+        learning_rate=0.0, policy_kwargs=LEARNERS[learner],
+    ).learn(n_steps * n_envs)  # fmt: skip
+    mean, own = 0.0, [0] * n_envs
+    draws, expected, variance = 0, 0.0, 0.0
+    for earlier, step in itertools.pairwise(venv.steps):
+        ended = earlier.terminated | earlier.truncated
+        for env in range(n_envs):
+            own[env] += 1
+            if ended[env]:
+                mean = 0.8 * mean + 0.2 * own[env] if mean else own[env]
+                own[env] = 0
+        for env in np.flatnonzero(~ended):
+            chance = min(1.0, 50.0 / max(mean, own[env]))
+            expected, variance = expected + chance, variance + chance * (1.0 - chance)
+            draws += int(abs(step.actions[env, 0] - earlier.actions[env, 0]) > 1e-9)
+    assert draws == pytest.approx(expected, abs=4 * math.sqrt(variance) + 0.01 * expected)
+
+
 def test_factored_exploration_draws_each_dimension() -> None:
     arguments: dict[str, Any] = {"shape": (2,), "action_points": TWO, "action_table": "factored"}
     actions = explore_only(2000, exploration_hold=1.0, **arguments)
@@ -578,6 +606,7 @@ def test_whole_numbers_are_rounded(learner: str) -> None:
 SAVED: dict[str, dict[str, Any]] = {
     "shared": {},
     "long hold": {"exploration_hold": 1e6, "exploration_initial_eps": 0.7, "exploration_final_eps": 0.7},
+    "automatic hold": {"exploration_hold": "auto"},
     "per neighbor": {"exploration": "per_neighbor"},
     "factored": {"action_points": TWO, "action_table": "factored"},
     "joint": {"action_points": TWO, "action_table": "joint"},
@@ -760,7 +789,7 @@ def test_single_precision() -> None:
         ({"exploration": "softmax"}, ["exploration", "'shared'", "'per_neighbor'", "'softmax'"]),
         ({"exploration_hold": 0.5}, ["exploration_hold", "[1, inf)", "0.5"]),
         ({"exploration_hold": float("nan")}, ["exploration_hold", "nan"]),
-        ({"exploration_hold": "long"}, ["exploration_hold", "'long'"]),
+        ({"exploration_hold": "long"}, ["exploration_hold", "'auto'", "'long'"]),
         ({"exploration_initial_eps": 1.1}, ["exploration_initial_eps", "[0, 1]", "1.1"]),
         ({"exploration_final_eps": -0.1}, ["exploration_final_eps", "[0, 1]", "-0.1"]),
         ({"exploration_fraction": 0.0}, ["exploration_fraction", "(0, 1]", "0.0"]),

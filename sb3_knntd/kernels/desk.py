@@ -5,14 +5,16 @@ fast as one array.
 perception     ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`: low, width, limit, search, axes, offsets,
                columns, weights, bandwidth
 choice         rule: ``AVERAGE`` or ``EACH``; target, exploration, random_ties of
-               :func:`sb3_knntd.kernels.step.choose`, and how long an exploring action is held; blocks (n_blocks + 1,):
-               where the columns of each of the action's parts begin; action_points (n_actions, action_dim)
+               :func:`sb3_knntd.kernels.step.choose`; least_hold, hold_share of :func:`sb3_knntd.kernels.step.hold`;
+               blocks (n_blocks + 1,): where the columns of each of the action's parts begin; action_points
+               (n_actions, action_dim)
 update         gamma, normalized (step), accumulating (traces), reset_others
 episodes       indices, probabilities (3, n_envs, k), entries (3, n_envs, k, n_blocks), the columns that each neighbour
                answers for, and actions (3, n_envs, action_dim): of the state that each environment left, ``NOW``, of
                the one it is in, ``THEN``, and of the ``LAST`` one before a truncation; truncated (n_envs,) and
                last_observations (n_envs, obs_dim): which episodes were, and what was seen last; held (n_envs,
-               n_blocks): the column that is being explored, ``GREEDY`` or ``UNDRAWN``
+               n_blocks): the column that is being explored, ``GREEDY`` or ``UNDRAWN``; lengths (1 + n_envs,): see
+               :func:`sb3_knntd.kernels.step.count_steps`
 memory         the arrays of :mod:`sb3_knntd.kernels.memory`
 log            sums of the TD errors' sizes and of the values, (2,)
 work           values (2, n_actions), corrections (n_envs,), places (n_envs, k), to be used
@@ -25,9 +27,9 @@ from collections import namedtuple
 from sb3_knntd.kernels.jit import AVAILABLE, jit
 
 EYES = ("low", "width", "limit", "search", "axes", "offsets", "columns", "weights", "bandwidth")
-RULE = ("rule", "target", "exploration", "random_ties", "hold", "blocks", "action_points")
+RULE = ("rule", "target", "exploration", "random_ties", "least_hold", "hold_share", "blocks", "action_points")
 FORM = ("gamma", "normalized", "accumulating", "reset_others")
-EPISODES = ("indices", "probabilities", "entries", "actions", "truncated", "last_observations", "held")
+EPISODES = ("indices", "probabilities", "entries", "actions", "truncated", "last_observations", "held", "lengths")
 MEMORY = (
     "values",
     "visited",
@@ -70,9 +72,9 @@ else:
 def set_desk(eyes, choice, form, episodes, memory, work):
     """A desk of the fields named above; compiled, as that is what numba keeps on disk."""
     low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
-    rule, target, exploration, random_ties, hold, blocks, action_points = choice
+    rule, target, exploration, random_ties, least_hold, hold_share, blocks, action_points = choice
     gamma, normalized, accumulating, reset_others = form
-    indices, probabilities, entries, actions, truncated, last_observations, held = episodes
+    indices, probabilities, entries, actions, truncated, last_observations, held, lengths = episodes
     values, visited, row_points, row_slots, initial, live_points, live, live_slots, counts, pace = memory
     sums, means, corrections, places = work
     return Desk(
@@ -89,7 +91,8 @@ def set_desk(eyes, choice, form, episodes, memory, work):
         target,
         exploration,
         random_ties,
-        hold,
+        least_hold,
+        hold_share,
         blocks,
         action_points,
         gamma,
@@ -103,6 +106,7 @@ def set_desk(eyes, choice, form, episodes, memory, work):
         truncated,
         last_observations,
         held,
+        lengths,
         values,
         visited,
         row_points,

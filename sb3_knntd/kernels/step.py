@@ -138,18 +138,36 @@ def choose_average(uniforms, rate, state, env, desk):
 
 
 @jit
+def count_steps(lengths, ended):
+    """
+    Keep account of how long episodes are.
+
+    :param lengths: the mean length of the episodes so far, the last counting a fifth (0 if none has ended), and the
+        number of steps in each environment's own, shape (1 + n_envs,)
+    :param ended: whether the step that was just made has ended it, shape (n_envs,), bool
+    """
+    for env in range(len(ended)):
+        lengths[1 + env] += 1.0
+        if ended[env]:
+            lengths[0] += (1.0 if lengths[0] == 0.0 else 0.2) * (lengths[1 + env] - lengths[0])
+            lengths[1 + env] = 0.0
+
+
+@jit
 def hold(uniforms, rate, env, desk):
     """
-    Go on with what is being explored, or draw anew whether to explore and what: the draw is held for
-    ``desk.hold`` steps in the mean.
+    Go on with what is being explored, or draw anew whether to explore and what. In the mean the draw is held for
+    ``desk.least_hold`` steps, or longer: for ``desk.hold_share`` of an episode, taken to be as long as they are in the
+    mean or as this one is already.
 
     :param uniforms: random numbers in [0, 1), of which the first 2 + n_blocks are used
     :param rate: ε, the share of draws that explore
     :param env: which environment
     :param desk: see :mod:`sb3_knntd.kernels.desk`
     """
-    held = desk.held[env]
-    if held[0] == UNDRAWN or uniforms[0] * desk.hold < 1.0:
+    held, lengths = desk.held[env], desk.lengths
+    steps = max(desk.least_hold, desk.hold_share * max(lengths[0], lengths[1 + env]))
+    if held[0] == UNDRAWN or uniforms[0] * steps < 1.0:
         for block in range(len(held)):
             first, end = desk.blocks[block], desk.blocks[block + 1]
             held[block] = first + pick(uniforms[2 + block], end - first) if uniforms[1] < rate else GREEDY
@@ -231,6 +249,7 @@ def begin(desk, observations, uniforms, rate):
     :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
     :param rate: ε or the temperature
     """
+    desk.lengths[1:] = 0.0
     for env in range(len(observations)):
         desk.held[env, :] = UNDRAWN
         perceive_and_choose(observations[env], uniforms[env], rate, NOW, env, desk)
@@ -264,6 +283,7 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
     _, n_envs, k, n_blocks = entries.shape
     size, value_sum = 0.0, 0.0
 
+    count_steps(desk.lengths, ended)
     for env in range(n_envs):
         if not np.isfinite(rewards[env]):
             return NOT_FINITE
