@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import time
 from importlib.resources import files
 from typing import Any
 
 import optuna
 from gymnasium import spaces
 from rl_zoo3.exp_manager import ExperimentManager
+from sqlalchemy.exc import DBAPIError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -20,6 +22,10 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"knntd": KNNTD, "exa": ExA}
 
 #: What a table is made for. As with a network's architecture, training goes on with what the saved model has.
 SHAPE = ("points", "bounds", "action_points", "action_table")
+
+#: How often, and after how many seconds, a database is tried again.
+DATABASE_RETRIES = 3
+DATABASE_PAUSE = 1.0
 
 
 class KNNExperimentManager(ExperimentManager):
@@ -71,6 +77,12 @@ class KNNExperimentManager(ExperimentManager):
             hyperparams = {name: value for name, value in hyperparams.items() if name not in SHAPE}
         return super()._load_pretrained_agent(hyperparams, env)
 
+    def hyperparameters_optimization(self) -> None:
+        """Search hyperparameters, alone or as one of several workers on a study."""
+        if self.storage is not None and not self.storage.endswith(".log"):
+            make_tables(self.storage)
+        super().hyperparameters_optimization()
+
     def objective(self, trial: optuna.Trial) -> float:
         """
         :param trial: trial of a study
@@ -79,3 +91,23 @@ class KNNExperimentManager(ExperimentManager):
         if self._is_ours:
             trial.set_user_attr(OBS_DIM, self.obs_dim)
         return super().objective(trial)
+
+
+def make_tables(url: str) -> None:
+    """
+    Make Optuna's tables in a database, if they are not there.
+
+    Optuna takes no lock for it: when several workers start at once on an empty database, all but one fail, and find
+    the tables when they try again.
+
+    :param url: the database, in SQLAlchemy's form
+    :raises sqlalchemy.exc.DBAPIError: if the database cannot be used
+    """
+    for retries_left in reversed(range(DATABASE_RETRIES + 1)):
+        try:
+            optuna.storages.RDBStorage(url).remove_session()
+            return
+        except DBAPIError:
+            if not retries_left:
+                raise
+            time.sleep(DATABASE_PAUSE)

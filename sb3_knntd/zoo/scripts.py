@@ -61,7 +61,7 @@ def register() -> None:
     rl_zoo3.ALGOS.update(ALGORITHMS)
     HYPERPARAMS_SAMPLER.update(SAMPLERS)
     HYPERPARAMS_CONVERTER.update(CONVERTERS)
-    rl_zoo3.train.ExperimentManager = KNNExperimentManager  # type: ignore[assignment, attr-defined]
+    rl_zoo3.train.ExperimentManager = KNNExperimentManager  # type: ignore[attr-defined]
 
 
 def run(name: str, arguments: Sequence[str]) -> None:
