@@ -103,6 +103,52 @@ def _run_demo(args: argparse.Namespace) -> int:
     return 0 if demo(args.env, args.steps, args.seed, args.out) else INTERRUPTED
 
 
+def _add_reproduce(subparsers: Subparsers) -> None:
+    from sb3_knntd.reproduce import FIGURES
+
+    parser = subparsers.add_parser(
+        "reproduce",
+        help="compute a figure of the paper over many seeds",
+        description="Compute a figure of the paper over many seeds, and write a table (CSV), a picture (PNG) and a "
+        "verdict, the paper's numbers beside ours. What is interrupted goes on where it was.",
+    )
+    figures = "; ".join(f"{name}: {figure.help}" for name, figure in FIGURES.items())
+    parser.add_argument("figure", choices=FIGURES, metavar="FIGURE", help=figures)
+    parser.add_argument("--best", action="store_true", help="this project's best settings, not the paper's")
+    parser.add_argument(
+        "--seeds", type=positive_int, default=30, metavar="N", help="number of seeds (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--first-seed",
+        type=seed_int,
+        default=1000,
+        metavar="N",
+        help="the best settings were tuned on seeds below 1000 (default: %(default)s)",
+    )
+    parser.add_argument("--episodes", type=positive_int, metavar="N", help="episodes of each seed")
+    parser.add_argument("--workers", type=positive_int, metavar="N", help="processes (default: one a core)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("results"), metavar="DIR", help="folder for all files (default: %(default)s)"
+    )
+    parser.set_defaults(run=_run_reproduce)
+
+
+def _run_reproduce(args: argparse.Namespace) -> int:
+    require("tqdm", "matplotlib", "yaml")
+    from sb3_knntd.reproduce.command import reproduce
+
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    if seeds[-1] >= 2**31:
+        raise CommandError(f"seeds go to 2147483647; got {args.seeds} from {args.first_seed} on")
+    try:
+        return reproduce(args.figure, args.best, seeds, args.episodes, args.out, args.workers)
+    except KeyboardInterrupt:
+        print(
+            f"\nInterrupted. What is finished is in {args.out}: the same command goes on from there.", file=sys.stderr
+        )
+        return INTERRUPTED
+
+
 def add_zoo(subparsers: Subparsers) -> None:
     """
     Add RL Zoo's scripts, each as a command that takes RL Zoo's own arguments.
@@ -124,7 +170,7 @@ def _run_zoo(args: argparse.Namespace) -> int:
 
 #: Each adds one command or several: the parser, and with ``set_defaults(run=...)`` the function that runs it and
 #: returns the exit code.
-COMMANDS: tuple[AddCommand, ...] = (_add_demo, add_zoo)
+COMMANDS: tuple[AddCommand, ...] = (_add_demo, _add_reproduce, add_zoo)
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "sb3-knntd", commands: Sequence[AddCommand] = COMMANDS) -> int:

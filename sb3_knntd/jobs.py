@@ -1,0 +1,239 @@
+"""
+Many independent jobs on the cores of this machine, each with its result in a file, so that what was interrupted goes
+on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_knntd.files import replace_file
+
+#: What keeps a worker's libraries to one thread: with a worker a core, more would only wait for each other.
+ONE_THREAD = {
+    f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR", "NUMBA")
+}
+#: How often a job is begun whose worker process dies.
+ATTEMPTS = 2
+#: Where there is no terminal, progress is told in so many lines.
+PROGRESS_LINES = 10
+
+
+class Job(NamedTuple):
+    """
+    Something to compute.
+
+    :param key: its name, and that of its file: letters, digits, ``_`` and ``-``
+    :param function: what computes it, a function that can be imported by its name
+    :param arguments: keyword arguments, of what JSON can hold
+    """
+
+    key: str
+    function: Callable[..., Any]
+    arguments: Mapping[str, Any]
+
+
+class Outcome(NamedTuple):
+    """
+    What became of a job.
+
+    :param result: what its function returned, as JSON gives it back
+    :param error: why there is no result, a traceback or a sentence; empty if there is one
+    """
+
+    result: Any = None
+    error: str = ""
+
+
+def run_jobs(jobs: Sequence[Job], folder: Path, workers: int | None = None, title: str = "") -> dict[str, Outcome]:
+    """
+    Compute what is not yet in the folder, several jobs at a time, with a progress bar on standard error.
+
+    The outcome of each job is stored when it is there, as ``key.json``. A result that was computed by the same function
+    from the same arguments is taken from its file; all else is computed, failures anew. Whatever ends the program, the
+    files that are there are whole, and the next call goes on from them.
+
+    :param jobs: what to compute, keys all different
+    :param folder: where outcomes are; made if it is not there
+    :param workers: number of processes; by default one for each core that this process may use
+    :param title: what the progress is of
+    :return: the outcome of each job, by key, in the order of ``jobs``
+    :raises ValueError: if a key is no file name or there twice, or ``workers`` < 1
+    :raises TypeError: if JSON cannot hold the arguments of a job
+    :raises OSError: if the folder cannot be written to
+    """
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers must be at least 1; got {workers}")
+    descriptions = {job.key: _description(job) for job in jobs}
+    if len(descriptions) < len(jobs):
+        raise ValueError(f"keys must differ; got {', '.join(job.key for job in jobs)}")
+    folder.mkdir(parents=True, exist_ok=True)
+
+    outcomes = {
+        key: outcome
+        for key, description in descriptions.items()
+        if (outcome := _stored_outcome(folder / f"{key}.json", description))
+    }
+    missing = [job for job in jobs if job.key not in outcomes]
+    arriving = run_locally(missing, workers or usable_cores())
+    with _progress(title, len(jobs), len(outcomes)) as tell, closing(arriving):
+        for job, outcome in arriving:
+            ending = {"error": outcome.error} if outcome.error else {"result": outcome.result}
+            replace_file(folder / f"{job.key}.json", json.dumps(descriptions[job.key] | ending).encode())
+            outcomes[job.key] = outcome
+            tell(bool(outcome.error))
+    return {job.key: outcomes[job.key] for job in jobs}
+
+
+def run_locally(jobs: Sequence[Job], workers: int) -> Generator[tuple[Job, Outcome], None, None]:
+    """
+    Compute jobs in processes of this machine. If the iterator is closed, or this process dies, so do they.
+
+    :param jobs: what to compute
+    :param workers: number of processes
+    :return: each job with its outcome, in the order in which they come to their end
+    """
+    context = multiprocessing.get_context("spawn")
+    # Nothing is ever sent. Workers end when it closes, which it does even if this process is killed.
+    lifeline, holder = context.Pipe(duplex=False)
+    # One process each: if it dies, that tells which job it died of.
+    idle = [_new_worker(context, lifeline) for _ in range(min(workers, len(jobs)))]
+    waiting = deque((job, 1) for job in jobs)
+    running: dict[Future[Outcome], tuple[Job, int, ProcessPoolExecutor]] = {}
+    try:
+        while waiting or running:
+            while waiting and idle:
+                (job, attempt), worker = waiting.popleft(), idle.pop()
+                with _environment(ONE_THREAD):  # a worker starts with its first job
+                    running[worker.submit(_compute, job)] = job, attempt, worker
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                job, attempt, worker = running.pop(future)
+                try:
+                    outcome = future.result()
+                except BrokenProcessPool:
+                    worker.shutdown()
+                    idle.append(_new_worker(context, lifeline))
+                    if attempt < ATTEMPTS:
+                        waiting.append((job, attempt + 1))
+                    else:
+                        yield job, Outcome(error=f"its process died {attempt} times: killed, or short of memory")
+                else:
+                    idle.append(worker)
+                    yield job, outcome
+    finally:
+        holder.close()
+        for worker in [*idle, *(worker for _, _, worker in running.values())]:
+            worker.shutdown(cancel_futures=True)
+        lifeline.close()
+
+
+def usable_cores() -> int:
+    """
+    :return: number of cores that this process may use
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _description(job: Job) -> dict[str, Any]:
+    """What its outcome depends on, as JSON gives it back."""
+    if not job.key or not all(character.isalnum() or character in "_-" for character in job.key):
+        raise ValueError(f"a key must be letters, digits, '_' and '-'; got {job.key!r}")
+    name = f"{job.function.__module__}.{job.function.__qualname__}"
+    description: dict[str, Any] = json.loads(json.dumps({"function": name, "arguments": job.arguments}))
+    return description
+
+
+def _stored_outcome(path: Path, description: dict[str, Any]) -> Outcome | None:
+    """The result in a file, if it is there and of just this job."""
+    try:
+        stored = json.loads(path.read_bytes())
+    except (FileNotFoundError, ValueError):
+        return None
+    if not isinstance(stored, dict) or "result" not in stored:
+        return None
+    result = stored.pop("result")
+    return Outcome(result) if stored == description else None
+
+
+def _new_worker(context: SpawnContext, lifeline: Connection) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, context, _start_worker, (lifeline,))
+
+
+def _start_worker(lifeline: Connection) -> None:
+    # Ctrl-C goes to all processes of a terminal. What is to become of the workers the first one decides.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+
+
+def _end_with(lifeline: Connection) -> None:
+    lifeline.poll(None)
+    os._exit(1)
+
+
+def _compute(job: Job) -> Outcome:
+    try:
+        return Outcome(json.loads(json.dumps(job.function(**job.arguments))))
+    except Exception:
+        return Outcome(error=traceback.format_exc())
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _progress(title: str, total: int, done: int) -> Iterator[Callable[[bool], None]]:
+    """
+    A progress bar on a terminal, else some lines.
+
+    :param title: what is in progress
+    :param total: number of jobs
+    :param done: number of those that were there already
+    :return: what to call for each job that has come to its end, with whether it failed
+    """
+    from tqdm import tqdm
+
+    terminal, every = sys.stderr.isatty(), -(-total // PROGRESS_LINES)
+    n_before, n_failed, start = done, 0, time.monotonic()
+    with tqdm(desc=title, total=total, initial=done, unit="job", disable=not terminal) as bar:
+
+        def tell(failed: bool) -> None:
+            nonlocal done, n_failed
+            done, n_failed = done + 1, n_failed + failed
+            failures = f", {n_failed} failed" if n_failed else ""
+            if terminal:
+                bar.set_postfix_str(failures.lstrip(", "), refresh=False)
+                bar.update()
+            elif done == total or done % every == 0:
+                left = (time.monotonic() - start) / (done - n_before) * (total - done)
+                print(f"{title}: {done} of {total}{failures}, {tqdm.format_interval(left)} left", file=sys.stderr)
+
+        yield tell

@@ -1,0 +1,13 @@
+"""The paper's figures, computed over seeds: one module a figure, and what they share."""
+
+from __future__ import annotations
+
+from sb3_knntd.reproduce.fig3 import FIG3
+from sb3_knntd.reproduce.fig6 import FIG6
+from sb3_knntd.reproduce.fig7 import FIG7
+from sb3_knntd.reproduce.figure import PaperFigure
+
+#: What ``sb3-knntd reproduce`` knows, by name.
+FIGURES: dict[str, PaperFigure] = {figure.name: figure for figure in (FIG3, FIG6, FIG7)}
+
+__all__ = ["FIGURES", "PaperFigure"]
