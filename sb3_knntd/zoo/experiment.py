@@ -20,8 +20,9 @@ from sb3_knntd.zoo.search_space import OBS_DIM
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"knntd": KNNTD, "exa": ExA}
 
-#: What a table is made for. As with a network's architecture, training goes on with what the saved model has.
-SHAPE = ("points", "bounds", "action_points", "action_table")
+#: What a table and its traces are made for. As with a network's architecture, training goes on with what the saved
+#: model has.
+SHAPE = ("points", "bounds", "n_neighbors", "action_points", "action_table")
 
 #: How often, and after how many seconds, a database is tried again.
 DATABASE_RETRIES = 3
@@ -35,7 +36,7 @@ class KNNExperimentManager(ExperimentManager):
     * takes its configuration from ``sb3_knntd.zoo_configs``,
     * reads schedules of all its arguments (:mod:`sb3_knntd.zoo.schedules`),
     * runs on the CPU, where the step is compiled, unless another device is named,
-    * goes on training (``-i``) with the points that the saved model has.
+    * goes on training (``-i``) with the points and neighbours that the saved model has.
 
     With the algorithms of RL Zoo it is RL Zoo's.
 
@@ -71,8 +72,8 @@ class KNNExperimentManager(ExperimentManager):
             given = [name for name in SHAPE if name in (self.custom_hyperparams or {})]
             if given:
                 raise ValueError(
-                    f"{' and '.join(given)} cannot be given with -i: training goes on with the table of "
-                    f"{self.trained_agent}. Train a new agent without -i"
+                    f"{' and '.join(given)} cannot be given with -i: training goes on with what "
+                    f"{self.trained_agent} has. Train a new agent without -i"
                 )
             hyperparams = {name: value for name, value in hyperparams.items() if name not in SHAPE}
         return super()._load_pretrained_agent(hyperparams, env)
