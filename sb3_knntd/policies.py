@@ -93,7 +93,7 @@ class KNNPolicy(BasePolicy):
             "bounds_from_space": bounds_from_space,
         }
         places = make_points(points, observation_space)
-        self.n_neighbors = _count_neighbors(n_neighbors, observation_space, places.n_points, places.obs_dim)
+        self.n_neighbors = count_neighbors(n_neighbors, observation_space, places.n_points, places.obs_dim)
         self.perceiver = Perceiver(
             make_bounds(bounds, observation_space, from_space=bounds_from_space),
             places,
@@ -341,7 +341,15 @@ class ExAPolicy(KNNPolicy):
         return th.from_numpy(self.fit_actions(actions.cpu().numpy()))
 
 
-def _count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
+def count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
+    """
+    :param n_neighbors: k, or ``"auto"``, see :class:`KNNPolicy`
+    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param n_points: number of points to choose from
+    :param obs_dim: number of observation dimensions
+    :return: k
+    :raises ValueError: if it is no integer >= 1, or there are not so many points
+    """
     exact = not isinstance(observation_space, spaces.Box)
     if isinstance(n_neighbors, str):
         if n_neighbors != "auto":
