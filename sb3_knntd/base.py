@@ -226,6 +226,7 @@ class KNNAlgorithm(BaseAlgorithm):
             self.gamma, self.step_size == "normalized", self.traces == "accumulating", bool(self.reset_other_actions)
         )
         self.learner = self._make_learner(rule, form)
+        self._adapts = self.policy.perceiver.bounds.adaptive
         self._rule = rule
         self.set_random_seed(self.seed)
 
@@ -399,6 +400,9 @@ class KNNAlgorithm(BaseAlgorithm):
             self._episode_num += ended.count(True)
             n_logs = self._episode_num // log_interval - before // log_interval if log_interval else 0
 
+        if self._adapts and not (self._measuring or self.policy.perceiver.sees(self._last_obs)):  # type: ignore[arg-type]
+            self._widen()
+
         if callback is not None:
             callback.update_locals(locals())
             if not callback.on_step():
@@ -452,13 +456,23 @@ class KNNAlgorithm(BaseAlgorithm):
         self.policy.perceiver.measure(th.from_numpy(observations).to(self.device))
         self._n_measured += self.n_envs
         self._measuring = self._must_measure()
-        if not self._measuring and self.verbose >= 1:
+        if not self._measuring:
+            self._tell_range(f"measured over {self._n_measured} random steps")
+
+    def _widen(self) -> None:
+        """Take in the last observations, and begin anew from there."""
+        self.policy.widen(th.from_numpy(self._last_obs).to(self.device))
+        self._last_actions = None
+        self._tell_range(f"widened at step {self.num_timesteps}")
+
+    def _tell_range(self, how: str) -> None:
+        if self.verbose >= 1:
             bounds = self.policy.perceiver.bounds
             ranges = ", ".join(
                 f"{dimension}: [{bounds.low[dimension]:.3g}, {bounds.high[dimension]:.3g}]"
                 for dimension in bounds.open.nonzero()[:, 0].tolist()
             )
-            print(f"Range measured over {self._n_measured} random steps, by observation dimension: {ranges}")
+            print(f"Range {how}, by observation dimension: {ranges}")
 
     # ---------------------------------------------------------------- logging
 

@@ -49,7 +49,9 @@ class KNNTD(KNNAlgorithm):
         (n_points, obs_dim) in observation units for scattered points; ``"auto"`` is a lattice of about 8000 points,
         at most 20 in a dimension, or one point a state on Discrete and MultiDiscrete observations
     :param bounds: the range mapped to [-1, 1]: (low, high), arrays (obs_dim,) in observation units; ``None`` takes the
-        space's, and finds a range for every dimension that has none in a random phase at the start of :meth:`learn`
+        space's, and finds a range for every dimension that has none in a random phase at the start of :meth:`learn`;
+        ``"adaptive"`` finds one for every dimension there, and widens it whenever an observation lies beyond, carrying
+        the values over to where a lattice's points then are and letting go the traces
     :param weights: ``"inverse_quadratic"``: 1 / (1 + d²/h²), eq. 5; ``"gaussian"``: exp(-d²/2h²); or a function from
         squared distances (batch, k), scaled units, to weights (batch, k), both torch tensors
     :param bandwidth: h of the weights, > 0, scaled units (the bounds are 2 wide)

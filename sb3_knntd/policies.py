@@ -38,7 +38,7 @@ class KNNPolicy(BasePolicy):
     :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for Discrete and
         MultiDiscrete
     :param points: ``"auto"``, an int, one int a dimension, or an array (n_points, obs_dim) in observation units
-    :param bounds: ``None`` or (low, high), arrays of shape (obs_dim,) in observation units
+    :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
         weights (batch, k)
     :param bandwidth: h of the weights, scaled units
@@ -159,6 +159,17 @@ class KNNPolicy(BasePolicy):
         ``set_parameters``.
         """
         return self.table.entries()
+
+    def widen(self, observations: th.Tensor) -> None:
+        """
+        Widen adaptive bounds to take in these observations. Where points move, each is given the values that the
+        table had there; the learner has to begin anew.
+
+        :param observations: shape (batch, *obs_shape), any number type, observation units
+        """
+        regridding = self.perceiver.widen(observations)
+        if regridding is not None:
+            self.table.carry_over(regridding)
 
     def perceive(self, observation: np.ndarray | th.Tensor) -> Perception:
         """

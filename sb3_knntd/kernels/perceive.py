@@ -14,6 +14,16 @@ INVERSE_QUADRATIC, GAUSSIAN = 0, 1
 
 
 @jit
+def are_within(observations, low, high):
+    """Whether all observations, shape (batch, obs_dim), lie within the bounds, shape (obs_dim,)."""
+    for row in range(observations.shape[0]):
+        for j in range(observations.shape[1]):
+            if observations[row, j] < low[j] or observations[row, j] > high[j]:
+                return False
+    return True
+
+
+@jit
 def perceive(
     observation, low, width, limit, search, axes, offsets, columns, weights, bandwidth, indices, probabilities
 ):

@@ -23,6 +23,20 @@ class Lender(Protocol):
         """Drop them: the table has been given other values."""
 
 
+class Regridding(Protocol):
+    """From the points where they were to where they are, see :class:`~sb3_knntd.perception.perceiver.Regridding`."""
+
+    def sources(self, indices: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Of points as they are, the points they were nearest to, and how much each of these counts."""
+
+    def targets(self, indices: th.Tensor) -> th.Tensor:
+        """Of points as they were, the point that is now nearest to each."""
+
+
+#: Points whose values are carried over in one go.
+BATCH = 2**16
+
+
 class QTable(nn.Module, ABC):
     """
     What every table does. A learner may keep newer values of some rows; it gives itself as ``lender``, and
@@ -96,6 +110,19 @@ class QTable(nn.Module, ABC):
             memory with this table
         """
 
+    @abstractmethod
+    def carry_over(self, regridding: Regridding) -> None:
+        """
+        Give each point the values that the table had where the point now is. A learner's traces are let go.
+
+        :param regridding: where the points were, and where they are
+        """
+
+    @staticmethod
+    def _carried(values: th.Tensor, sources: tuple[th.Tensor, th.Tensor]) -> th.Tensor:
+        """The mean of the rows at ``sources``, rows of shape (n, k, n_actions), shape (n, n_actions)."""
+        return (sources[1][..., None].to(values.dtype) * values).sum(dim=1)
+
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         self.sync()
         super()._save_to_state_dict(destination, prefix, keep_vars)
@@ -152,6 +179,20 @@ class DenseTable(QTable):
 
     def reserve(self, n_points: int) -> bool:
         return False
+
+    def carry_over(self, regridding: Regridding) -> None:
+        old, was_visited = self.entries().clone(), self._visits()
+        self._forget_lent()
+        self.visited.zero_()
+        for points in th.arange(len(old), device=old.device).split(BATCH):
+            sources = regridding.sources(points)
+            self.values[points] = self._carried(old[sources[0]], sources)
+            self.visit(points[was_visited[sources[0][:, 0]]])
+
+    def _visits(self) -> th.Tensor:
+        """Which rows have been learned at, shape (n_points,), bool."""
+        bits = th.arange(8, device=self.visited.device, dtype=th.uint8)
+        return ((self.visited[:-1, None] >> bits) & 1).bool().flatten()[: len(self.values)]
 
     def arrays(self) -> tuple[Any, ...]:
         no_points, no_slots = np.empty(0, np.int64), np.empty((0, 2), np.int64)
@@ -210,6 +251,12 @@ class HashedTable(QTable):
         self._resize(max(2 * len(self.values), self.n_visited + n_points))
         return True
 
+    def carry_over(self, regridding: Regridding) -> None:
+        self.sync()
+        points = th.cat([regridding.targets(part) for part in self.points().split(BATCH)]).unique()
+        values = th.cat([self._carried(self.rows(s[0]), s) for s in map(regridding.sources, points.split(BATCH))])
+        self._refill(points, values)
+
     def arrays(self) -> tuple[Any, ...]:
         no_bits = np.empty(0, np.uint8)
         return self.values.numpy(), no_bits, self.row_points.numpy(), self._slots, self.initial_value
@@ -223,27 +270,27 @@ class HashedTable(QTable):
         self._slots = make_slots(capacity)
         rehash(self.row_points.numpy(), self.n_visited, self._slots)
 
+    def _refill(self, points: th.Tensor, values: th.Tensor) -> None:
+        """Have these rows and no others."""
+        self._forget_lent()
+        # Nothing of the rows there were may show through those to be made.
+        self.values, self.row_points = self.values[:0], self.row_points[:0]
+        self.counts[0] = 0
+        self._resize(max(self.SMALLEST, len(points)))
+        self.values[: len(points)] = values
+        self.row_points[: len(points)] = points
+        self.counts[0] = len(points)
+        rehash(self.row_points.numpy(), len(points), self._slots)
+
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         for name in ("values", "row_points"):
             destination[prefix + name] = destination[prefix + name][: self.n_visited].clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        self._forget_lent()
-        n_rows = len(state_dict[prefix + "values"])
-        self.counts[0] = 0
-        # Nothing of the rows there were may show through those to be made.
-        for name in ("values", "row_points"):
-            setattr(self, name, getattr(self, name)[:0])
-        self._resize(max(self.SMALLEST, n_rows))
-        state_dict = dict(state_dict)
-        for name in ("values", "row_points"):
-            whole = getattr(self, name).clone()
-            whole[:n_rows] = state_dict[prefix + name]
-            state_dict[prefix + name] = whole
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        self.counts[0] = n_rows
-        rehash(self.row_points.numpy(), n_rows, self._slots)
+        self._refill(state_dict[prefix + "row_points"], state_dict[prefix + "values"])
+        whole = {prefix + name: getattr(self, name).clone() for name in ("values", "row_points")}
+        super()._load_from_state_dict({**state_dict, **whole}, prefix, *args)
 
 
 def make_slots(capacity: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from torch import nn
 
 #: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
 LARGEST_SENSIBLE_BOUND = 1e10
-#: A measured range is widened by this share on either side, since a better policy sees more than a random one.
+#: A range is widened by this share beyond what was seen, since a better policy sees more than a random one.
 MARGIN = 0.25
 #: Scaled values end here, far outside of any point, so that no distance swallows the differences of others.
 FARTHEST = 1e4
@@ -23,9 +23,12 @@ class Bounds(nn.Module):
 
     A dimension whose bounds are infinite, larger than 1e10 or empty (low >= high) is *open*: it stands at
     [-1, 1] until :meth:`measure` has seen observations, then at their range, widened by a quarter on either side.
+    *Adaptive* bounds are open in all dimensions, and :meth:`widen` whenever an observation lies beyond them, up to
+    the bounds given.
 
     :param low: lower bounds, shape (obs_dim,), observation units
     :param high: upper bounds, shape (obs_dim,), observation units
+    :param adaptive: whether the bounds are to follow the observations
     """
 
     low: th.Tensor
@@ -33,14 +36,20 @@ class Bounds(nn.Module):
     open: th.Tensor
     seen_low: th.Tensor
     seen_high: th.Tensor
+    lowest: th.Tensor
+    highest: th.Tensor
 
-    def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
+    def __init__(self, low: np.ndarray, high: np.ndarray, adaptive: bool = False) -> None:
         super().__init__()
+        self.adaptive = adaptive
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         sensible = (np.abs(low) <= LARGEST_SENSIBLE_BOUND) & (np.abs(high) <= LARGEST_SENSIBLE_BOUND) & (low < high)
-        self.register_buffer("low", th.from_numpy(np.where(sensible, low, -1.0)))
-        self.register_buffer("high", th.from_numpy(np.where(sensible, high, 1.0)))
-        self.register_buffer("open", th.from_numpy(~sensible))
+        is_open = ~sensible | adaptive
+        self.register_buffer("low", th.from_numpy(np.where(is_open, -1.0, low)))
+        self.register_buffer("high", th.from_numpy(np.where(is_open, 1.0, high)))
+        self.register_buffer("open", th.from_numpy(is_open))
+        self.register_buffer("lowest", th.from_numpy(np.where(sensible, low, -np.inf)), persistent=False)
+        self.register_buffer("highest", th.from_numpy(np.where(sensible, high, np.inf)), persistent=False)
         self.register_buffer("seen_low", th.full_like(self.low, th.inf))
         self.register_buffer("seen_high", th.full_like(self.low, -th.inf))
 
@@ -65,8 +74,28 @@ class Bounds(nn.Module):
         width = self.seen_high - self.seen_low
         # A dimension that has not moved yet gets a range of one unit on either side.
         margin = th.where(width > 0, MARGIN * width, 1.0)
-        self.low.copy_(th.where(self.open, self.seen_low - margin, self.low))
-        self.high.copy_(th.where(self.open, self.seen_high + margin, self.high))
+        self._set(
+            th.where(self.open, self.seen_low - margin, self.low),
+            th.where(self.open, self.seen_high + margin, self.high),
+        )
+
+    def widen(self, observations: th.Tensor) -> None:
+        """
+        Take in these observations on the sides that they lie beyond, and a quarter of the range more.
+
+        :param observations: shape (batch, obs_dim), finite
+        """
+        lowest = th.minimum(self.low, observations.amin(dim=0))
+        highest = th.maximum(self.high, observations.amax(dim=0))
+        margin = MARGIN * (highest - lowest)
+        self._set(
+            th.where(lowest < self.low, lowest - margin, self.low),
+            th.where(highest > self.high, highest + margin, self.high),
+        )
+
+    def _set(self, low: th.Tensor, high: th.Tensor) -> None:
+        self.low.copy_(th.maximum(low, self.lowest))
+        self.high.copy_(th.minimum(high, self.highest))
 
     def scale(self, observations: th.Tensor) -> th.Tensor:
         """
@@ -85,8 +114,8 @@ class Bounds(nn.Module):
 
 def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space: bool = True) -> Bounds:
     """
-    :param bounds: ``None`` for the space's own, or a pair (low, high) of arrays of shape (obs_dim,)
-        in observation units
+    :param bounds: ``None`` for the space's own, ``"adaptive"`` to follow the observations within the space's own, or
+        a pair (low, high) of arrays of shape (obs_dim,) in observation units
     :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
     :param from_space: whether the space tells the range; with VecNormalize around the environment it does
         not, and all dimensions are open unless ``bounds`` are given
@@ -94,17 +123,22 @@ def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space
     :raises ValueError: if ``bounds`` has another form, is not finite, or low >= high somewhere
     """
     low, high = _bounds_of(observation_space)
+    if bounds is None and from_space:
+        return Bounds(low, high)
+    unbounded = np.full_like(low, -np.inf), np.full_like(high, np.inf)
     if bounds is None:
-        return Bounds(low, high) if from_space else Bounds(np.full_like(low, -np.inf), np.full_like(high, np.inf))
+        return Bounds(*unbounded)
     if not isinstance(observation_space, spaces.Box):
         raise ValueError(
             f"bounds must be None for a {type(observation_space).__name__} observation space, whose states are "
             f"the points; got {bounds!r}"
         )
+    if isinstance(bounds, str) and bounds == "adaptive":
+        return Bounds(*((low, high) if from_space else unbounded), adaptive=True)
     try:
         given_low, given_high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"bounds must be None or a pair (low, high) of arrays; got {bounds!r}") from error
+        raise ValueError(f"bounds must be None, 'adaptive', or a pair (low, high) of arrays; got {bounds!r}") from error
     for name, given in (("low", given_low), ("high", given_high)):
         if given.shape != low.shape:
             raise ValueError(

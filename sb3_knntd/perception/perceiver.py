@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_knntd.kernels.perceive import FOUND
+from sb3_knntd.kernels.perceive import FOUND, are_within
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
-from sb3_knntd.perception.points import Points
+from sb3_knntd.perception.points import Lattice, Points
 from sb3_knntd.perception.search import Neighbors, Search
 from sb3_knntd.perception.weights import KernelWeights, Weights
 
@@ -24,6 +26,37 @@ class Perception(NamedTuple):
 
     indices: th.Tensor
     probabilities: th.Tensor
+
+
+class Regridding:
+    """
+    A lattice before and after its bounds were widened.
+
+    :param perceiver: as it is now
+    :param before: the bounds as they were
+    """
+
+    def __init__(self, perceiver: Perceiver, before: Bounds) -> None:
+        self._perceiver = perceiver
+        self._before = before
+
+    def sources(self, indices: th.Tensor) -> Perception:
+        """
+        :param indices: points, shape (n,), int64
+        :return: what an observation at the place where each now is would have been before: a function of the
+            observations is carried over by giving each point the value that the function had there
+        """
+        after = self._perceiver.bounds
+        places = after.unscale(self._perceiver.points.coordinates(after, indices))
+        return self._perceiver.perceive_scaled(self._before.scale(places))
+
+    def targets(self, indices: th.Tensor) -> th.Tensor:
+        """
+        :param indices: points, shape (n,), int64
+        :return: the point that is now nearest to the place where each was, shape (n,), int64
+        """
+        places = self._before.unscale(self._perceiver.points.coordinates(self._before, indices))
+        return self._perceiver.perceive_scaled(self._perceiver.bounds.scale(places)).indices[:, 0]
 
 
 class Perceiver(nn.Module):
@@ -53,6 +86,7 @@ class Perceiver(nn.Module):
     def fit(self) -> None:
         """Bring the search up to date with the bounds and their device."""
         self.search.fit(self.bounds)
+        self._low, self._high = self.bounds.low.cpu().numpy(), self.bounds.high.cpu().numpy()
         self.eyes = self._make_eyes()
         self.search_is_outside = self.eyes is not None and self.eyes[3] == FOUND
 
@@ -79,12 +113,38 @@ class Perceiver(nn.Module):
         self.bounds.measure(self._flat(observations))
         self.fit()
 
+    def sees(self, observations: np.ndarray) -> bool:
+        """
+        :param observations: shape (batch, *obs_shape), any number type, observation units
+        :return: whether all lie within the bounds
+        """
+        return bool(are_within(observations.reshape(-1, self.bounds.obs_dim), self._low, self._high))
+
+    def widen(self, observations: th.Tensor) -> Regridding | None:
+        """
+        Widen adaptive bounds to take in these observations.
+
+        :param observations: shape (batch, *obs_shape), any number type
+        :return: where the points were and are; ``None`` if they are scattered, and have stayed where they were
+        """
+        before = copy.deepcopy(self.bounds)
+        self.bounds.widen(self._flat(observations))
+        self.fit()
+        return Regridding(self, before) if isinstance(self.points, Lattice) else None
+
     def forward(self, observations: th.Tensor) -> Perception:
         """
         :param observations: shape (batch, *obs_shape), any number type, observation units
         :return: their perceptions
         """
-        indices, squared_distances = self.find(observations)
+        return self.perceive_scaled(self.bounds.scale(self._flat(observations)))
+
+    def perceive_scaled(self, scaled: th.Tensor) -> Perception:
+        """
+        :param scaled: observations, shape (batch, obs_dim), scaled units
+        :return: their perceptions
+        """
+        indices, squared_distances = self.search.query(scaled)
         weights = self.weights(squared_distances)
         return Perception(indices, weights / weights.sum(dim=1, keepdim=True))
 
