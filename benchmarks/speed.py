@@ -26,21 +26,22 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.machine import describe
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, ExA
 
 
-class Drift(gym.Env[np.ndarray, int]):
+class Drift(gym.Env[np.ndarray, Any]):
     """
     A walk in a box that costs next to nothing, so that the learner's own time shows: an action pushes one
     dimension, a wall throws it back. Episodes end after ``length`` steps only.
 
     :param obs_dim: number of dimensions
     :param length: steps of an episode
+    :param continuous: whether actions are a Box
     """
 
-    def __init__(self, obs_dim: int = 2, length: int = 200) -> None:
+    def __init__(self, obs_dim: int = 2, length: int = 200, continuous: bool = False) -> None:
         self.observation_space = spaces.Box(-1.0, 1.0, (obs_dim,), np.float32)
-        self.action_space = spaces.Discrete(3)
+        self.action_space = spaces.Box(0.0, 2.0) if continuous else spaces.Discrete(3)
         self.length = length
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
@@ -50,9 +51,9 @@ class Drift(gym.Env[np.ndarray, int]):
         self.state = np.zeros(self.observation_space.shape, np.float32)
         return self.state, {}
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         state = self.state + self.moves[self.steps % 4096]
-        state[0] += 0.02 * (int(action) - 1)
+        state[0] += 0.02 * (action.item() - 1.0)
         self.state = np.clip(state, -0.95, 0.95)
         self.steps += 1
         return self.state, -1.0, self.steps >= self.length, False, {}
@@ -114,7 +115,12 @@ def steps_per_second(work: Callable[[int], Any], n_steps: int) -> float:
 
 def bare_loop(venv: VecEnv, n_steps: int) -> None:
     """Random actions, drawn beforehand, in an environment that nobody learns from."""
-    actions = np.random.default_rng(0).integers(0, venv.action_space.n, (n_steps, venv.num_envs))  # type: ignore[attr-defined]
+    random, space, size = np.random.default_rng(0), venv.action_space, (n_steps, venv.num_envs)
+    if isinstance(space, spaces.Discrete):
+        actions = random.integers(0, space.n, size)
+    else:
+        assert isinstance(space, spaces.Box)
+        actions = random.uniform(space.low, space.high, (*size, *space.shape)).astype(space.dtype)
     venv.reset()
     for i in range(n_steps // venv.num_envs):
         venv.step(actions[i])
@@ -122,25 +128,70 @@ def bare_loop(venv: VecEnv, n_steps: int) -> None:
 
 def paper_model(env: Any, points: Any = (20, 15), n_neighbors: int = 4, **arguments: Any) -> KNNTD:
     """The paper's size of problem."""
-    return KNNTD(env, points=points, n_neighbors=n_neighbors, trace_decay=0.95, seed=0, **arguments)
+    return KNNTD(env, **{"points": points, "n_neighbors": n_neighbors, "trace_decay": 0.95, "seed": 0, **arguments})
 
 
-def learn_seconds(model: KNNTD, n_steps: int) -> float:
+def continuous_model(env: Any, points: Any = (20, 15), n_neighbors: int = 8, **arguments: Any) -> ExA:
+    """Eleven action points and eight neighbours, as in the paper's Fig. 7."""
+    given = {"action_points": 11, "points": points, "n_neighbors": n_neighbors, "trace_decay": 0.95, "seed": 0}
+    return ExA(env, **{**given, **arguments})
+
+
+def learn_seconds(model: KNNTD | ExA, n_steps: int) -> float:
     """Microseconds that a step takes in ``learn``."""
     return 1e6 / steps_per_second(lambda n: model.learn(n), n_steps)
 
 
-def against_bare_loop(repeats: int, n_envs: int) -> Row:
-    model = paper_model(make_vec_env("MountainCar-v0", n_envs, seed=0))
-    venv = make_vec_env("MountainCar-v0", n_envs, seed=0)
-    n_steps = 32_000
+def against_bare_loop(repeats: int, model: KNNTD | ExA, env_id: str, target: str) -> Row:
+    venv = make_vec_env(env_id, model.n_envs, seed=0)
+    # Short runs in turns, so that a machine that is faster now and slower then is so for both.
+    n_steps = 8_000
     return compare(
-        f"learn over the bare loop, MountainCar-v0, n_envs {n_envs}",
-        ">= 0.75",
+        f"{type(model).__name__}.learn over the bare loop, {env_id}, n_envs {model.n_envs}",
+        target,
         lambda: steps_per_second(lambda n: model.learn(n), n_steps),
         lambda: steps_per_second(lambda n: bare_loop(venv, n), n_steps),
-        repeats,
+        4 * repeats,
         "steps/s",
+    )
+
+
+def discrete_against_bare_loop(repeats: int, n_envs: int) -> Row:
+    model = paper_model(make_vec_env("MountainCar-v0", n_envs, seed=0))
+    return against_bare_loop(repeats, model, "MountainCar-v0", ">= 0.75")
+
+
+def continuous_against_bare_loop(repeats: int) -> Row:
+    model = continuous_model(make_vec_env("Pendulum-v1", 1, seed=0), points=(9, 9, 21))
+    return against_bare_loop(repeats, model, "Pendulum-v1", ">= 0.65")
+
+
+def continuous_over_points(repeats: int) -> Row:
+    many, few = (
+        continuous_model(make_vec_env(lambda: Drift(continuous=True), 1, seed=0), points=p)
+        for p in ((1000, 1000), (20, 15))
+    )
+    return compare(
+        "ExA: a step with a lattice of 10^6 points over 300",
+        "<= 1.25",
+        lambda: learn_seconds(many, 16_000),
+        lambda: learn_seconds(few, 16_000),
+        repeats,
+        "µs",
+    )
+
+
+def continuous_over_neighbors(repeats: int) -> Row:
+    many, few = (
+        continuous_model(make_vec_env("Pendulum-v1", 1, seed=0), points=(9, 9, 21), n_neighbors=k) for k in (200, 4)
+    )
+    return compare(
+        "ExA: a step with k = 200 over k = 4, Pendulum-v1",
+        "<= 2.5",
+        lambda: learn_seconds(many, 8_000),
+        lambda: learn_seconds(few, 8_000),
+        repeats,
+        "µs",
     )
 
 
@@ -209,11 +260,11 @@ class Stopwatch(BaseCallback):
         return True
 
 
-def long_episode(repeats: int) -> Row:
+def long_episode(repeats: int, continuous: bool) -> Row:
     ratios, details = [], []
     for _ in range(repeats):
-        venv = make_vec_env(lambda: Drift(2, length=10**9), 1, seed=0)
-        model = KNNTD(venv, points=(20, 15), n_neighbors=4, trace_decay=0.99, gamma=1.0, seed=0)
+        venv = make_vec_env(lambda: Drift(2, length=10**9, continuous=continuous), 1, seed=0)
+        model = (continuous_model if continuous else paper_model)(venv, trace_decay=0.99, gamma=1.0)
         watch = Stopwatch()
         model.learn(100_000, callback=watch)
         thousands = np.diff(watch.times)
@@ -223,7 +274,7 @@ def long_episode(repeats: int) -> Row:
         details.append((last * 1e3, first * 1e3))
     last, first = (statistics.median(column) for column in zip(*details, strict=True))
     return Row(
-        "an episode of 10^5 steps, λ 0.99, γ 1: its last steps over its first",
+        f"{'ExA: ' if continuous else ''}an episode of 10^5 steps, λ 0.99, γ 1: its last steps over its first",
         statistics.median(ratios),
         min(ratios),
         max(ratios),
@@ -365,13 +416,17 @@ def cuda(repeats: int) -> list[Row]:
 
 
 BENCHMARKS: dict[str, Callable[[int], Row | list[Row]]] = {
-    "bare1": lambda repeats: against_bare_loop(repeats, 1),
-    "bare64": lambda repeats: against_bare_loop(repeats, 64),
+    "bare1": lambda repeats: discrete_against_bare_loop(repeats, 1),
+    "bare64": lambda repeats: discrete_against_bare_loop(repeats, 64),
+    "exa_bare": continuous_against_bare_loop,
+    "exa_points": continuous_over_points,
+    "exa_neighbors": continuous_over_neighbors,
+    "exa_episode": lambda repeats: long_episode(repeats, True),
     "dqn": against_dqn,
     "points": over_points,
     "huge": huge_lattice,
     "neighbors": over_neighbors,
-    "episode": long_episode,
+    "episode": lambda repeats: long_episode(repeats, False),
     "kd_tree": lambda repeats: over_scattered(repeats, "kd_tree", "<= 3"),
     "hnsw": lambda repeats: over_scattered(repeats, "hnsw", "<= 2"),
     "predict": prediction,
