@@ -138,7 +138,7 @@ class KNNAlgorithm(BaseAlgorithm):
 
     @abstractmethod
     def _env_actions(self, actions: np.ndarray) -> np.ndarray:
-        """From the rule's actions to those of the environment, shape (n_envs, *action_shape)."""
+        """From the rule's actions to those of the environment, an array of its own, shape (n_envs, *action_shape)."""
 
     # ----------------------------------------------------------------- set-up
 
@@ -217,7 +217,9 @@ class KNNAlgorithm(BaseAlgorithm):
             **self._policy_arguments(),
             **self.policy_kwargs,
         ).to(self.device)
-        rule = self._make_rule()
+        self._rule = rule = self._make_rule()
+        self._stream = RandomStream((self.n_envs, 2, rule.n_uniforms))
+        self._prediction_stream = RandomStream((rule.n_uniforms,), purpose=1)
         if self.verbose >= 1:
             print(
                 f"Neighbours by search={self.policy.search_name!r} over {self.policy.perceiver.points.n_points} points"
@@ -227,15 +229,14 @@ class KNNAlgorithm(BaseAlgorithm):
         )
         self.learner = self._make_learner(rule, form)
         self._adapts = self.policy.perceiver.bounds.adaptive
-        self._rule = rule
         self.set_random_seed(self.seed)
 
     def _make_learner(self, rule: ActionRule, form: Form) -> Learner:
         perceiver, table = self.policy.perceiver, self.policy.table
         if self.policy.is_compiled:
-            return CompiledLearner(perceiver, table, rule, self.n_envs, form)
+            return CompiledLearner(perceiver, table, rule, self._stream, self.n_envs, form)
         assert isinstance(table, DenseTable)
-        return TorchLearner(perceiver, table, rule, self.n_envs, form, one_step=self.trace_decay == 0.0)
+        return TorchLearner(perceiver, table, rule, self._stream, self.n_envs, form, one_step=self.trace_decay == 0.0)
 
     def _check_parameters(self) -> None:
         self.learning_rate = check_schedule("learning_rate", self.learning_rate, 0.0)
@@ -261,8 +262,8 @@ class KNNAlgorithm(BaseAlgorithm):
             operating system's entropy
         """
         super().set_random_seed(seed)
-        self._stream = RandomStream(seed, (self.n_envs, 2, self._rule.n_uniforms))
-        self._prediction_stream = RandomStream(seed, (self._rule.n_uniforms,), purpose=1)
+        self._stream.seed(seed)
+        self._prediction_stream.seed(seed)
 
     def predict(
         self,
@@ -285,7 +286,7 @@ class KNNAlgorithm(BaseAlgorithm):
         if deterministic:
             return greedy, state
         rows, probabilities = self.policy.perceived_rows(np.asarray(observation))
-        uniforms = th.from_numpy(np.stack([self._prediction_stream.next() for _ in range(len(rows))]))
+        uniforms = th.from_numpy(np.stack([self._prediction_stream.next().copy() for _ in range(len(rows))]))
         uniforms, rate = uniforms.to(rows.device), self.exploration_rate
         nothing = th.full((len(rows), len(self._rule.blocks) - 1), UNDRAWN, device=rows.device)
         held = self._rule.hold(nothing, uniforms, rate, th.zeros(len(rows), device=rows.device))
@@ -368,7 +369,8 @@ class KNNAlgorithm(BaseAlgorithm):
         actions = self._last_actions
         if actions is None or self._measuring:
             actions = self._random_actions() if self._measuring else self._first_actions()
-        new_obs, rewards, dones, infos = env.step(self._env_actions(actions))
+        actions = self._env_actions(actions)
+        new_obs, rewards, dones, infos = env.step(actions)
         n_before = self.num_timesteps
         self.num_timesteps += env.num_envs
         self._current_progress_remaining = progress_remaining(self.num_timesteps, self._total_timesteps)
@@ -384,7 +386,6 @@ class KNNAlgorithm(BaseAlgorithm):
                     dones,
                     truncated,
                     last_obs,
-                    self._stream.next(),
                     self._rates(),
                 )
         except (ValueError, FloatingPointError) as error:
@@ -423,7 +424,7 @@ class KNNAlgorithm(BaseAlgorithm):
     def _first_actions(self) -> np.ndarray:
         """The actions chosen at the start of the episodes."""
         assert isinstance(self._last_obs, np.ndarray)
-        self._last_actions = self.learner.begin(self._last_obs, self._stream.next()[:, 0], self._rates()[2])
+        self._last_actions = self.learner.begin(self._last_obs, self._rates()[2])
         return self._last_actions
 
     @staticmethod

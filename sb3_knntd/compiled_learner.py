@@ -12,6 +12,7 @@ from sb3_knntd.kernels.desk import set_desk
 from sb3_knntd.learner import DIVERGENCE, Form, Learner, Rates, check_finite, check_transition
 from sb3_knntd.memory import LiveStore, QTable
 from sb3_knntd.perception import Perceiver
+from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule
 
 FLOAT32 = np.dtype(np.float32)
@@ -24,13 +25,17 @@ class CompiledLearner(Learner):
     :param perceiver: where am I? With weights that are known to the kernels
     :param table: what is it worth?
     :param rule: what do I do?
+    :param stream: rows of random numbers, shape (n_envs, 2, rule.n_uniforms)
     :param n_envs: number of environments
     :param form: which of the update's forms
     """
 
-    def __init__(self, perceiver: Perceiver, table: QTable, rule: ActionRule, n_envs: int, form: Form) -> None:
+    def __init__(
+        self, perceiver: Perceiver, table: QTable, rule: ActionRule, stream: RandomStream, n_envs: int, form: Form
+    ) -> None:
         self.perceiver = perceiver
         self.table = table
+        self.stream = stream
         self.n_envs = n_envs
         self.live = LiveStore(table, n_envs)
         self._rule = rule.kernel_arguments()
@@ -68,8 +73,8 @@ class CompiledLearner(Learner):
     def _set_desk(self) -> None:
         """Take up perception and memory as they are now, and reckon for how many steps there is room."""
         self._eyes = self.perceiver.eyes
-        memory = self.live.memory()
-        self._desk = set_desk(self._eyes, self._rule, self._form, self._episodes, memory, self._work)
+        memory, chance = self.live.memory(), (self.stream.rows, self.stream.taken)
+        self._desk = set_desk(self._eyes, self._rule, self._form, self._episodes, memory, chance, self._work)
         self._steps_of_room = min(self.live.room, self.table.room) // self._most_new_points
 
     def _make_room(self) -> None:
@@ -78,14 +83,14 @@ class CompiledLearner(Learner):
             self._set_desk()
         self._steps_of_room = min(self.live.room, self.table.room) // self._most_new_points
 
-    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
+    def begin(self, observations: np.ndarray, rate: float) -> np.ndarray:
         check_finite("an observation", observations, range(self.n_envs))
         self.live.clear()
         self._set_desk()
         seen = as_rows(observations)
         self._find(seen, kernel.NOW)
-        kernel.begin(self._desk, seen, uniforms, rate)
-        return self._actions.copy()
+        kernel.begin(self._desk, seen, self.stream.next()[:, 0], rate)
+        return self._actions
 
     def learn(
         self,
@@ -94,7 +99,6 @@ class CompiledLearner(Learner):
         ended: np.ndarray,
         truncated: list[int],
         last_observations: np.ndarray,
-        uniforms: np.ndarray,
         rates: Rates,
     ) -> np.ndarray:
         if self.perceiver.eyes is not self._eyes:
@@ -111,7 +115,10 @@ class CompiledLearner(Learner):
             self._truncated[truncated] = True
             self._last_observations[truncated] = as_rows(last_observations)
             self._find(self._last_observations[truncated], kernel.LAST, truncated)
-        answer = kernel.learn(self._desk, seen, rewards, ended, uniforms, rates)
+        answer = kernel.learn(self._desk, seen, rewards, ended, rates)
+        if answer == kernel.USED_UP:
+            self.stream.refill()
+            answer = kernel.learn(self._desk, seen, rewards, ended, rates)
         if truncated:
             self._truncated[:] = False
         if answer == kernel.NOT_FINITE:
@@ -119,7 +126,7 @@ class CompiledLearner(Learner):
         if answer == kernel.DIVERGED:
             raise FloatingPointError(DIVERGENCE)
         self._n_sums += self.n_envs
-        return self._actions.copy()
+        return self._actions
 
     def summary(self) -> dict[str, float]:
         if not self._n_sums:

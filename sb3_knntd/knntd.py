@@ -168,8 +168,8 @@ class KNNTD(KNNAlgorithm):
 
     def _env_actions(self, actions: np.ndarray) -> np.ndarray:
         assert isinstance(self.action_space, spaces.Discrete)
-        start = self.action_space.start
-        return actions + start if start else actions
+        env_actions: np.ndarray = actions + self.action_space.start
+        return env_actions
 
     def learn(
         self: SelfKNNTD,

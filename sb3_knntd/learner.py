@@ -12,6 +12,7 @@ import torch as th
 from sb3_knntd.kernels.step import UNDRAWN, count_steps
 from sb3_knntd.memory import DenseTable, DenseTraces, OneStepTraces, Traces
 from sb3_knntd.perception import Perceiver, Perception
+from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule, Choice
 
 #: The scheduled parameters at one step: α, λ, and ε or the temperature.
@@ -43,15 +44,14 @@ class Learner(ABC):
     n_envs: int
 
     @abstractmethod
-    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
+    def begin(self, observations: np.ndarray, rate: float) -> np.ndarray:
         """
         Start an episode in every environment.
 
         :param observations: shape (n_envs, *obs_shape)
-        :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
         :param rate: ε or the temperature
         :return: the action to take in each environment: its index, shape (n_envs,), int64, or a vector, shape
-            (n_envs, action_dim)
+            (n_envs, action_dim); it holds until the next call
         :raises ValueError: if an observation is not finite
         """
 
@@ -63,7 +63,6 @@ class Learner(ABC):
         ended: np.ndarray,
         truncated: list[int],
         last_observations: np.ndarray,
-        uniforms: np.ndarray,
         rates: Rates,
     ) -> np.ndarray:
         """
@@ -75,11 +74,9 @@ class Learner(ABC):
         :param ended: whether the episode ended, shape (n_envs,), bool
         :param truncated: the environments whose episode ended by a time limit, rising
         :param last_observations: the true last observation of each of these, shape (len(truncated), *obs_shape)
-        :param uniforms: random numbers in [0, 1), shape (n_envs, 2, n_uniforms): for the next action, and for
-            the one that would have been taken at a truncation
         :param rates: the scheduled parameters
         :return: the action to take in each environment: its index, shape (n_envs,), int64, or a vector, shape
-            (n_envs, action_dim)
+            (n_envs, action_dim); it holds until the next call
         :raises ValueError: if an observation or reward is not finite; nothing has been changed then
         :raises FloatingPointError: if the values have diverged; nothing has been changed then
         """
@@ -145,17 +142,26 @@ class TorchLearner(Learner):
     :param perceiver: where am I?
     :param table: what is it worth?
     :param rule: what do I do?
+    :param stream: rows of random numbers, shape (n_envs, 2, rule.n_uniforms)
     :param n_envs: number of environments
     :param form: which of the update's forms
     :param one_step: whether λ is 0 throughout, and no trace has to be kept
     """
 
     def __init__(
-        self, perceiver: Perceiver, table: DenseTable, rule: ActionRule, n_envs: int, form: Form, one_step: bool = False
+        self,
+        perceiver: Perceiver,
+        table: DenseTable,
+        rule: ActionRule,
+        stream: RandomStream,
+        n_envs: int,
+        form: Form,
+        one_step: bool = False,
     ) -> None:
         self.perceiver = perceiver
         self.table = table
         self.rule = rule
+        self.stream = stream
         self.n_envs = n_envs
         self.form = form
         kind = "accumulating" if form.accumulating else "replacing"
@@ -174,8 +180,9 @@ class TorchLearner(Learner):
         self._sums = values.new_zeros(2)
         self._n_sums = 0
 
-    def begin(self, observations: np.ndarray, uniforms: np.ndarray, rate: float) -> np.ndarray:
+    def begin(self, observations: np.ndarray, rate: float) -> np.ndarray:
         check_finite("an observation", observations, range(self.n_envs))
+        uniforms = self.stream.next()[:, 0]
         self.traces.clear()
         self.lengths[1:] = 0.0
         self._hold(UNDRAWN, uniforms, rate)
@@ -189,9 +196,9 @@ class TorchLearner(Learner):
         ended: np.ndarray,
         truncated: list[int],
         last_observations: np.ndarray,
-        uniforms: np.ndarray,
         rates: Rates,
     ) -> np.ndarray:
+        uniforms = self.stream.next()
         check_transition(observations, rewards)
         count_steps(self.lengths, ended)
         held, over = self.held, self._tensor(ended)

@@ -321,6 +321,7 @@ class ExAPolicy(KNNPolicy):
         columns = make_action_columns(action_space, action_points, action_table)
         super().__init__(observation_space, action_space, lr_schedule, columns=columns, **arguments)
         self._arguments |= {"action_points": action_points, "action_table": action_table}
+        self._actions_are_whole = np.issubdtype(action_space.dtype, np.integer)
 
     @property
     def action_points(self) -> list[th.Tensor]:
@@ -334,10 +335,11 @@ class ExAPolicy(KNNPolicy):
         """
         space = self.action_space
         assert isinstance(space, spaces.Box)
-        whole = np.issubdtype(space.dtype, np.integer)
-        actions = (np.rint(actions) if whole else actions).reshape(-1, *space.shape)
-        fitting: np.ndarray = np.clip(actions.astype(space.dtype), space.low, space.high)
-        return fitting
+        if self._actions_are_whole:
+            actions = np.rint(actions)
+        fitting: np.ndarray = actions.reshape(-1, *space.shape).astype(space.dtype)
+        np.maximum(fitting, space.low, out=fitting)
+        return np.minimum(fitting, space.high, out=fitting)
 
     def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         return self.fit_actions((probabilities[..., None] * self.columns.points[entries].sum(axis=2)).sum(axis=1))

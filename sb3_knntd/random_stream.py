@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,41 +15,59 @@ class RandomStream:
     Rows of uniform random numbers from the counter-based generator Philox, so that a row is a function of
     the key and its number alone and a saved position is all it takes to go on.
 
-    :param seed: seed, or ``None`` for one from the operating system
     :param shape: shape of a row
     :param purpose: streams of one seed for different purposes have nothing in common
     """
 
-    def __init__(self, seed: int | None, shape: tuple[int, ...], purpose: int = 0) -> None:
-        self.shape = shape
-        self._key = np.random.SeedSequence(seed, spawn_key=(purpose,)).generate_state(2, np.uint64)
-        self._position = 0
-        self._rows: Iterator[np.ndarray] = iter(())
+    def __init__(self, shape: tuple[int, ...], purpose: int = 0) -> None:
+        self._purpose = purpose
+        #: the present block of rows, numbers in [0, 1)
+        self.rows = np.empty((ROWS_PER_BLOCK, *shape))
+        #: how many of them have been taken, shape (1,), int64; a kernel takes them by itself
+        self.taken = np.zeros(1, np.int64)
+        self.seed(None)
+
+    def seed(self, seed: int | None) -> None:
+        """
+        Begin a sequence.
+
+        :param seed: seed, or ``None`` for one from the operating system
+        """
+        self._key = np.random.SeedSequence(seed, spawn_key=(self._purpose,)).generate_state(2, np.uint64)
+        self._fill(0)
 
     def next(self) -> np.ndarray:
         """
-        :return: the next row, numbers in [0, 1), a view that must not be written to
+        :return: the next row, a view that must not be written to and that holds until the next call
         """
-        row = next(self._rows, None)
-        if row is None:
-            number, done = divmod(self._position, ROWS_PER_BLOCK)
-            bits = np.random.Philox(key=self._key, counter=[0, 0, number, 0])
-            block = np.random.Generator(bits).random((ROWS_PER_BLOCK, *self.shape))
-            self._rows = iter(block[done:])
-            row = next(self._rows)
-        self._position += 1
+        if self.taken[0] == ROWS_PER_BLOCK:
+            self.refill()
+        self.taken[0] += 1
+        row: np.ndarray = self.rows[self.taken[0] - 1]
         return row
+
+    def refill(self) -> None:
+        """Go on to the next block, all rows of the present one having been taken."""
+        self._fill(self._number + 1)
+
+    def _fill(self, number: int) -> None:
+        self._number = number
+        bits = np.random.Philox(key=self._key, counter=[0, 0, number, 0])
+        np.random.Generator(bits).random(out=self.rows)
+        self.taken[0] = 0
 
     def state(self) -> dict[str, Any]:
         """
         :return: key and position, plain integers
         """
-        return {"key": [int(word) for word in self._key], "position": self._position}
+        position = self._number * ROWS_PER_BLOCK + int(self.taken[0])
+        return {"key": [int(word) for word in self._key], "position": position}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """
         :param state: what :meth:`state` returned
         """
         self._key = np.array(state["key"], dtype=np.uint64)
-        self._position = state["position"]
-        self._rows = iter(())
+        number, taken = divmod(state["position"], ROWS_PER_BLOCK)
+        self._fill(number)
+        self.taken[0] = taken

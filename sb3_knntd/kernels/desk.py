@@ -16,6 +16,8 @@ episodes       indices, probabilities (3, n_envs, k), entries (3, n_envs, k, n_b
                n_blocks): the column that is being explored, ``GREEDY`` or ``UNDRAWN``; lengths (1 + n_envs,): see
                :func:`sb3_knntd.kernels.step.count_steps`
 memory         the arrays of :mod:`sb3_knntd.kernels.memory`
+chance         uniforms (n_rows, n_envs, 2, n_uniforms): rows of random numbers in [0, 1), for the next action and for
+               the one that would have been taken at a truncation; taken (1,): how many of the rows have been
 log            sums of the TD errors' sizes and of the values, (2,)
 work           values (2, n_actions), corrections (n_envs,), places (n_envs, k), to be used
 """
@@ -42,8 +44,9 @@ MEMORY = (
     "counts",
     "pace",
 )
+CHANCE = ("uniforms", "taken")
 WORK = ("sums", "means", "corrections", "places")
-FIELDS = (*EYES, *RULE, *FORM, *EPISODES, *MEMORY, *WORK)
+FIELDS = (*EYES, *RULE, *FORM, *EPISODES, *MEMORY, *CHANCE, *WORK)
 
 if AVAILABLE:
     from numba.core import types
@@ -69,13 +72,14 @@ else:
 
 
 @jit
-def set_desk(eyes, choice, form, episodes, memory, work):
+def set_desk(eyes, choice, form, episodes, memory, chance, work):
     """A desk of the fields named above; compiled, as that is what numba keeps on disk."""
     low, width, limit, search, axes, offsets, columns, weights, bandwidth = eyes
     rule, target, exploration, random_ties, least_hold, hold_share, blocks, action_points = choice
     gamma, normalized, accumulating, reset_others = form
     indices, probabilities, entries, actions, truncated, last_observations, held, lengths = episodes
     values, visited, row_points, row_slots, initial, live_points, live, live_slots, counts, pace = memory
+    uniforms, taken = chance
     sums, means, corrections, places = work
     return Desk(
         low,
@@ -117,6 +121,8 @@ def set_desk(eyes, choice, form, episodes, memory, work):
         live_slots,
         counts,
         pace,
+        uniforms,
+        taken,
         sums,
         means,
         corrections,

@@ -28,8 +28,9 @@ GREEDY, UNDRAWN = -1, -2
 
 #: Which state's arrays.
 NOW, THEN, LAST = 0, 1, 2
-#: What :func:`learn` answers: all is well, the environments' numbers are not finite, or the table's are not.
-FINE, NOT_FINITE, DIVERGED = 0, 1, 2
+#: What :func:`learn` answers: all is well, there are no more random numbers, the environments' numbers are not finite,
+#: or the table's are not.
+FINE, USED_UP, NOT_FINITE, DIVERGED = 0, 1, 2, 3
 
 
 @jit
@@ -51,14 +52,16 @@ def best_action(values, first, end):
 @jit
 def greedy_action(values, first, end, uniform, random_ties):
     """The best action from ``first`` to before ``end``, drawn from equals or the first of them."""
-    best = best_action(values, first, end)
-    if not random_ties:
+    best, ties = first, 1
+    for action in range(first + 1, end):
+        if values[action] > values[best]:
+            best, ties = action, 1
+        elif values[action] == values[best]:
+            ties += 1
+    if ties == 1 or not random_ties:
         return best
-    ties = 0
-    for action in range(first, end):
-        ties += values[action] == values[best]
     rank = pick(uniform, ties)
-    for action in range(first, end):
+    for action in range(best, end):
         if values[action] == values[best]:
             if rank == 0:
                 return action
@@ -256,7 +259,7 @@ def begin(desk, observations, uniforms, rate):
 
 
 @jit
-def learn(desk, observations, rewards, ended, uniforms, rates):
+def learn(desk, observations, rewards, ended, rates):
     """
     Perceive, choose, compute the TD errors and credit them (Algorithm 3), in all environments at once: every
     value is read before any is changed.
@@ -265,10 +268,14 @@ def learn(desk, observations, rewards, ended, uniforms, rates):
     :param observations: observation units, shape (n_envs, obs_dim)
     :param rewards: shape (n_envs,)
     :param ended: whether the episodes have, shape (n_envs,), bool
-    :param uniforms: random numbers in [0, 1), shape (n_envs, 2, n_uniforms)
     :param rates: (α, λ, ε or temperature)
-    :return: ``FINE``; or ``NOT_FINITE`` or ``DIVERGED``, and then no value has been changed
+    :return: ``FINE``; or ``USED_UP``, and then nothing has been done, or ``NOT_FINITE`` or ``DIVERGED``, and then no value
+        has been changed
     """
+    if desk.taken[0] == len(desk.uniforms):
+        return USED_UP
+    uniforms = desk.uniforms[desk.taken[0]]
+    desk.taken[0] += 1
     learning_rate, trace_decay, rate = rates
     values, visited, row_points, row_slots = desk.values, desk.visited, desk.row_points, desk.row_slots
     live_points, live, live_slots, counts, pace = (
