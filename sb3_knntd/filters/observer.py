@@ -72,6 +72,7 @@ class Observer:
             self._advance(observations, columns, training, filtered)
         if training:
             self.table.n_steps += self.n_envs
+            self.table.follow(filtered)
         return filtered
 
     def _advance_compiled(

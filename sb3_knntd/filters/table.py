@@ -76,7 +76,9 @@ class DeltaTable:
             n_columns = int(action_space.n)
         elif isinstance(action_space, spaces.Box):
             points = make_action_columns(action_space, arguments.action_points, "joint").points
-            self._action_width = (action_space.high - action_space.low).reshape(-1).astype(np.float64)
+            width = action_space.high.astype(np.float64) - action_space.low
+            # A dimension that is fixed has all its points in one place.
+            self._action_width = np.where(width > 0, width, 1.0).reshape(-1)
             self._action_points = points / self._action_width
             n_columns = len(points)
         else:
@@ -197,7 +199,7 @@ class DeltaTable:
             if not all(0 <= column < space.n for column in columns.tolist()):
                 raise ValueError(f"actions must be in {space}; got {actions.tolist()}")
             return columns
-        places = actions.reshape(-1, len(self._action_width)) / self._action_width
+        places = actions.reshape(len(actions), -1) / self._action_width
         if not np.isfinite(places).all():
             raise ValueError(f"actions must be finite; got {actions.tolist()}")
         nearest: np.ndarray = np.square(places[:, None] - self._action_points).sum(axis=2).argmin(axis=1)
@@ -229,6 +231,20 @@ class DeltaTable:
         """
         self.perceiver.measure(th.from_numpy(observations))
         self.n_measured += len(observations)
+
+    def follow(self, estimates: np.ndarray) -> None:
+        """
+        Widen adaptive bounds where estimates lie beyond them. Where points move, each is given what the table had there.
+
+        :param estimates: shape (n_envs, obs_dim)
+        """
+        if not self.perceiver.bounds.adaptive or self.perceiver.sees(estimates):
+            return
+        regridding = self.perceiver.widen(th.from_numpy(estimates))
+        if regridding is not None:
+            around, shares = regridding.sources(th.arange(self.perceiver.points.n_points))
+            for array in (self.deltas, self.visits):
+                array[:] = np.einsum("ik,ik...->i...", shares.numpy(), array[around.numpy()])
 
     def state_dict(self) -> dict[str, Any]:
         """
