@@ -79,7 +79,7 @@ class EpisodeVideoCallback(PacedCallback):
     def _writers(self) -> list[Any]:
         """TensorBoard's own: an animated image is none of the values that SB3's logger knows."""
         outputs = picture_formats(self.logger)
-        return [output.writer.file_writer for output in outputs if isinstance(output, TensorBoardOutputFormat)]
+        return [output.writer for output in outputs if isinstance(output, TensorBoardOutputFormat)]
 
     def _act(self) -> None:
         gif, (height, width) = self.record()
@@ -87,7 +87,9 @@ class EpisodeVideoCallback(PacedCallback):
             from tensorboard.compat.proto.summary_pb2 import Summary
 
             image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=gif)
-            writer.add_summary(Summary(value=[Summary.Value(tag="video/episode", image=image)]), self.num_timesteps)
+            summary = Summary(value=[Summary.Value(tag="video/episode", image=image)])
+            writer.file_writer.add_summary(summary, self.num_timesteps)
+            writer.flush()
         if self.folder is not None:
             path = self.folder / f"episode_{self.num_timesteps}.gif"
             path.write_bytes(gif)

@@ -38,9 +38,9 @@ class Footprints:
         self._n_buffered = self._route_start = 0
 
     @property
-    def is_full(self) -> bool:
-        """Whether :meth:`count` has to be called before more can be added."""
-        return self._n_buffered == len(self._buffer)
+    def room(self) -> int:
+        """How often something can be added before :meth:`count` has to be called."""
+        return len(self._buffer) - self._n_buffered
 
     def begin(self, observations: np.ndarray) -> None:
         """

@@ -12,6 +12,9 @@ from stable_baselines3.common.logger import CSVOutputFormat, HumanOutputFormat, 
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.checks import check_integer
 
+#: ``freq=None``: calls between two looks at the clock.
+CALLS_BETWEEN_LOOKS = 16
+
 
 class PacedCallback(BaseCallback):
     """
@@ -47,6 +50,26 @@ class PacedCallback(BaseCallback):
         self._acted_at = self.n_calls
         self._seconds = self.FIRST_SECONDS
         self._rested_since = time.perf_counter()
+        self._look_at = self._next_look()
+
+    # A step takes some 30 µs, and what SB3 does around _on_step is felt. So on_step itself does as little as it can.
+
+    def on_step(self) -> bool:
+        self.n_calls += 1
+        if self.n_calls >= self._look_at:
+            self.num_timesteps = self.model.num_timesteps
+            self._on_step()
+            self._look_at = self._next_look()
+        return True
+
+    def update_locals(self, locals_: dict[str, Any]) -> None:
+        self.locals = locals_
+
+    def on_rollout_start(self) -> None:
+        """Nothing to do."""
+
+    def on_rollout_end(self) -> None:
+        """Nothing to do."""
 
     def _on_step(self) -> bool:
         if self.freq is None:
@@ -61,8 +84,13 @@ class PacedCallback(BaseCallback):
             self._seconds = self._rested_since - start
         return True
 
+    def _next_look(self) -> int:
+        """The next call at which there may be something to do."""
+        return self.n_calls + (CALLS_BETWEEN_LOOKS if self.freq is None else self.freq - self.n_calls % self.freq)
+
     def _on_training_end(self) -> None:
         if self.n_calls > self._acted_at:
+            self.num_timesteps = self.model.num_timesteps
             self._acted_at = self.n_calls
             self._act()
 

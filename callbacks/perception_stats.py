@@ -76,15 +76,18 @@ class PerceptionStatsCallback(PacedCallback):
         self._generator = np.random.default_rng(0)
 
     def _on_training_start(self) -> None:
-        super()._on_training_start()
         self._sample = deque(maxlen=-(-self.n_samples // self.model.n_envs))
         self._before: np.ndarray | None = None
         self._sample_at = self.n_calls + 1
+        super()._on_training_start()
 
     def _on_step(self) -> bool:
-        if self.n_calls >= self._sample_at:
+        if self.n_calls == self._sample_at:
             self._take()
         return super()._on_step()
+
+    def _next_look(self) -> int:
+        return min(super()._next_look(), self._sample_at)
 
     def _take(self) -> None:
         """Keep the observations, and in the next step what came of them."""

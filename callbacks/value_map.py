@@ -38,8 +38,8 @@ COLUMNS = 3
 class ValueMapCallback(PacedCallback):
     """
     Draws over two dimensions of the observations: the value V(s) = max_a Q(s, a) with the ways that the last episodes
-    of the first environment took, the greedy action, and how often each place was visited since training began (how
-    many steps of all environments led there). A picture is drawn when training ends, and before that every
+    of the first environment took, the greedy action, and how often each place was visited since the callback is in use
+    (how many steps of all environments led there). A picture is drawn when training ends, and before that every
     ``draw_freq`` calls.
 
     Pictures go to TensorBoard's images under ``map/value``, if the model logs there, and to ``folder``, if one is
@@ -87,7 +87,7 @@ class ValueMapCallback(PacedCallback):
         self.resolution = check_integer("resolution", resolution, 1)
         self.folder = None if folder is None else Path(folder)
         self.names = names
-        self._footprints: Footprints | None = None
+        self._footprints = Footprints(dims, self.resolution, self.n_routes)
 
     def _init_callback(self) -> None:
         # What does not fit is to be known before hours of training.
@@ -96,7 +96,6 @@ class ValueMapCallback(PacedCallback):
         new_figure(1.0, 1.0)
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
-        self._footprints = Footprints(self.dims, self.resolution, self.n_routes)
 
     def _on_training_start(self) -> None:
         if self.folder is None and not picture_formats(self.logger):
@@ -105,23 +104,26 @@ class ValueMapCallback(PacedCallback):
                 "folder='pictures'"
             )
         assert isinstance(self.model._last_obs, np.ndarray)
-        assert self._footprints is not None
         self._footprints.begin(self.model._last_obs)
         super()._on_training_start()
 
-    def _on_step(self) -> bool:
+    def on_step(self) -> bool:
         footprints, observations = self._footprints, self.locals["new_obs"]
-        assert footprints is not None
         if self.locals["dones"][0]:
             footprints.end_route(last_observation(self.locals["infos"], observations))
         footprints.add(observations)
-        if footprints.is_full:
-            footprints.count(self._extent())
+        return super().on_step()
+
+    def _on_step(self) -> bool:
+        if self._footprints.room == 0:
+            self._footprints.count(self._extent())
         return super()._on_step()
+
+    def _next_look(self) -> int:
+        return min(super()._next_look(), self.n_calls + self._footprints.room)
 
     def _on_training_end(self) -> None:
         super()._on_training_end()
-        assert self._footprints is not None
         self._footprints.count(self._extent())
 
     def _extent(self) -> tuple[float, float, float, float]:
@@ -150,7 +152,6 @@ class ValueMapCallback(PacedCallback):
         :return: the picture as of now; save it with ``figure.savefig(path)``
         """
         footprints = self._footprints
-        assert footprints is not None
         footprints.count(self._extent())
         names = names_for(self.model, self.names)
         n_panels = count_panels(self.model) + 1

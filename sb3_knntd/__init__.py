@@ -5,9 +5,10 @@ from __future__ import annotations
 from importlib.metadata import version
 
 from sb3_knntd.exa import ExA
+from sb3_knntd.filters import DeltaFilter, VecDeltaFilter
 from sb3_knntd.knntd import KNNTD
 from sb3_knntd.perception import Perception
 from sb3_knntd.policies import ExAPolicy, KNNPolicy
 
-__all__ = ["KNNTD", "ExA", "ExAPolicy", "KNNPolicy", "Perception"]
+__all__ = ["KNNTD", "DeltaFilter", "ExA", "ExAPolicy", "KNNPolicy", "Perception", "VecDeltaFilter"]
 __version__ = version("sb3-knntd")

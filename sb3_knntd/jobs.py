@@ -1,6 +1,6 @@
 """
-Many independent jobs on the cores of this machine, each with its result in a file, so that what was interrupted goes
-on where it was.
+Many independent jobs, each with its result in a file, so that what was interrupted goes on where it was. Here they are
+computed on the cores of this machine; :mod:`sb3_knntd.ray_jobs` has other machines compute them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnContext
+from multiprocessing.context import ForkServerContext, SpawnContext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,8 +31,9 @@ ONE_THREAD = {
 }
 #: How often a job is begun whose worker process dies.
 ATTEMPTS = 2
-#: Where there is no terminal, progress is told in so many lines.
+#: Where there is no terminal, progress is told in so many lines, and when so many seconds have passed since the last.
 PROGRESS_LINES = 10
+PROGRESS_SECONDS = 60.0
 
 
 class Job(NamedTuple):
@@ -61,7 +62,14 @@ class Outcome(NamedTuple):
     error: str = ""
 
 
-def run_jobs(jobs: Sequence[Job], folder: Path, workers: int | None = None, title: str = "") -> dict[str, Outcome]:
+#: What computes jobs: it tells of each when it begins, with ``None``, and when it has come to its end.
+Event = tuple[Job, Outcome | None]
+Backend = Callable[[Sequence[Job]], Generator[Event, None, None]]
+
+
+def run_jobs(
+    jobs: Sequence[Job], folder: Path, workers: int | None = None, title: str = "", backend: Backend | None = None
+) -> dict[str, Outcome]:
     """
     Compute what is not yet in the folder, several jobs at a time, with a progress bar on standard error.
 
@@ -73,6 +81,7 @@ def run_jobs(jobs: Sequence[Job], folder: Path, workers: int | None = None, titl
     :param folder: where outcomes are; made if it is not there
     :param workers: number of processes; by default one for each core that this process may use
     :param title: what the progress is of
+    :param backend: what computes them; by default so many processes of this machine
     :return: the outcome of each job, by key, in the order of ``jobs``
     :raises ValueError: if a key is no file name or there twice, or ``workers`` < 1
     :raises TypeError: if JSON cannot hold the arguments of a job
@@ -91,25 +100,35 @@ def run_jobs(jobs: Sequence[Job], folder: Path, workers: int | None = None, titl
         if (outcome := _stored_outcome(folder / f"{key}.json", description))
     }
     missing = [job for job in jobs if job.key not in outcomes]
-    arriving = run_locally(missing, workers or usable_cores())
-    with _progress(title, len(jobs), len(outcomes)) as tell, closing(arriving):
-        for job, outcome in arriving:
+    events = run_locally(missing, workers or usable_cores()) if backend is None else backend(missing)
+    running: set[str] = set()
+    with _progress(title, len(jobs), len(outcomes)) as tell, closing(events):
+        for job, outcome in events:
+            if outcome is None:
+                running.add(job.key)
+                tell(None, len(running))
+                continue
+            running.discard(job.key)
             ending = {"error": outcome.error} if outcome.error else {"result": outcome.result}
             replace_file(folder / f"{job.key}.json", json.dumps(descriptions[job.key] | ending).encode())
             outcomes[job.key] = outcome
-            tell(bool(outcome.error))
+            tell(outcome, len(running))
     return {job.key: outcomes[job.key] for job in jobs}
 
 
-def run_locally(jobs: Sequence[Job], workers: int) -> Generator[tuple[Job, Outcome], None, None]:
+def run_locally(
+    jobs: Sequence[Job], workers: int, fresh: bool = False, preload: Sequence[str] = ()
+) -> Generator[Event, None, None]:
     """
     Compute jobs in processes of this machine. If the iterator is closed, or this process dies, so do they.
 
     :param jobs: what to compute
     :param workers: number of processes
-    :return: each job with its outcome, in the order in which they come to their end
+    :param fresh: whether each job gets a process of its own, as it must where memory is measured
+    :param preload: modules that fresh processes find imported, where the system can do that
+    :return: each job when it begins, and with its outcome in the order in which they come to their end
     """
-    context = multiprocessing.get_context("spawn")
+    context = _context(preload if fresh else ())
     # Nothing is ever sent. Workers end when it closes, which it does even if this process is killed.
     lifeline, holder = context.Pipe(duplex=False)
     # One process each: if it dies, that tells which job it died of.
@@ -121,26 +140,38 @@ def run_locally(jobs: Sequence[Job], workers: int) -> Generator[tuple[Job, Outco
             while waiting and idle:
                 (job, attempt), worker = waiting.popleft(), idle.pop()
                 with _environment(ONE_THREAD):  # a worker starts with its first job
-                    running[worker.submit(_compute, job)] = job, attempt, worker
+                    running[worker.submit(compute, job)] = job, attempt, worker
+                yield job, None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, attempt, worker = running.pop(future)
                 try:
                     outcome = future.result()
                 except BrokenProcessPool:
+                    outcome = None
+                if fresh or outcome is None:
                     worker.shutdown()
-                    idle.append(_new_worker(context, lifeline))
-                    if attempt < ATTEMPTS:
-                        waiting.append((job, attempt + 1))
-                    else:
-                        yield job, Outcome(error=f"its process died {attempt} times: killed, or short of memory")
-                else:
-                    idle.append(worker)
+                    worker = _new_worker(context, lifeline)
+                idle.append(worker)
+                if outcome is not None:
                     yield job, outcome
+                elif attempt < ATTEMPTS:
+                    waiting.append((job, attempt + 1))
+                else:
+                    yield job, Outcome(error=f"its process died {attempt} times: killed, or short of memory")
     finally:
         holder.close()
         for worker in [*idle, *(worker for _, _, worker in running.values())]:
             worker.shutdown(cancel_futures=True)
         lifeline.close()
+
+
+def _context(preload: Sequence[str]) -> SpawnContext | ForkServerContext:
+    """How processes are started: anew, or from one that has imported what they need."""
+    if not preload or "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(preload))
+    return context
 
 
 def usable_cores() -> int:
@@ -173,7 +204,7 @@ def _stored_outcome(path: Path, description: dict[str, Any]) -> Outcome | None:
     return Outcome(result) if stored == description else None
 
 
-def _new_worker(context: SpawnContext, lifeline: Connection) -> ProcessPoolExecutor:
+def _new_worker(context: SpawnContext | ForkServerContext, lifeline: Connection) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, context, _start_worker, (lifeline,))
 
 
@@ -188,7 +219,11 @@ def _end_with(lifeline: Connection) -> None:
     os._exit(1)
 
 
-def _compute(job: Job) -> Outcome:
+def compute(job: Job) -> Outcome:
+    """
+    :param job: what to compute, here and now
+    :return: its outcome; what its function raises is the reason why there is no result
+    """
     try:
         return Outcome(json.loads(json.dumps(job.function(**job.arguments))))
     except Exception:
@@ -210,30 +245,37 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 @contextmanager
-def _progress(title: str, total: int, done: int) -> Iterator[Callable[[bool], None]]:
+def _progress(title: str, total: int, done: int) -> Iterator[Callable[[Outcome | None, int], None]]:
     """
     A progress bar on a terminal, else some lines.
 
     :param title: what is in progress
     :param total: number of jobs
     :param done: number of those that were there already
-    :return: what to call for each job that has come to its end, with whether it failed
+    :return: what to call for each job when it begins, with ``None``, and when it has come to its end, with its outcome;
+        and both times with how many are running now
     """
     from tqdm import tqdm
 
     terminal, every = sys.stderr.isatty(), -(-total // PROGRESS_LINES)
     n_before, n_failed, start = done, 0, time.monotonic()
+    told = start
     with tqdm(desc=title, total=total, initial=done, unit="job", disable=not terminal) as bar:
 
-        def tell(failed: bool) -> None:
-            nonlocal done, n_failed
-            done, n_failed = done + 1, n_failed + failed
-            failures = f", {n_failed} failed" if n_failed else ""
+        def tell(outcome: Outcome | None, n_running: int) -> None:
+            nonlocal done, n_failed, told
+            if outcome is not None:
+                done, n_failed = done + 1, n_failed + bool(outcome.error)
+            states = [f"{n} {state}" for n, state in ((n_running, "running"), (n_failed, "failed")) if n]
             if terminal:
-                bar.set_postfix_str(failures.lstrip(", "), refresh=False)
-                bar.update()
-            elif done == total or done % every == 0:
-                left = (time.monotonic() - start) / (done - n_before) * (total - done)
-                print(f"{title}: {done} of {total}{failures}, {tqdm.format_interval(left)} left", file=sys.stderr)
+                bar.set_postfix_str(", ".join(states))
+                bar.update(outcome is not None)
+            elif outcome is not None:
+                now = time.monotonic()
+                if done == total or done % every == 0 or now - told >= PROGRESS_SECONDS:
+                    told = now
+                    left = (now - start) / (done - n_before) * (total - done)
+                    words = [f"{title}: {done} of {total}", *states, f"{tqdm.format_interval(left)} left"]
+                    print(", ".join(words), file=sys.stderr)
 
         yield tell

@@ -88,9 +88,9 @@ def verdict(results: Results) -> str:
         n_never, n_within = episodes.count(math.inf), sum(episode <= 2 * claim for episode in episodes)
         share = float(np.mean([each.share for each in successes]))
         sentences.append(
-            f"{NAMES[algorithm]}: the paper needs {claim}; here the median is {interval(episodes)}, in brackets the 10 % "
-            f"and 90 % quantiles; {n_never} of {len(episodes)} seeds never get there; of the {FOLLOWED} episodes that "
-            f"follow, {100 * share:.1f} % last {FULL} steps (0 for never). Median at most {claim}: "
+            f"{NAMES[algorithm]}: the paper needs {claim}; here the median is {interval(episodes)}, in brackets the "
+            f"10 % and 90 % quantiles; {n_never} of {len(episodes)} seeds never get there; of the {FOLLOWED} episodes "
+            f"that follow, {100 * share:.1f} % last {FULL} steps (0 for never). Median at most {claim}: "
             f"{yes_no(quantile(episodes, 0.5) <= claim)}; nine seeds in ten within {2 * claim} "
             f"({n_within} of {len(episodes)}): {yes_no(n_within >= MOST * len(episodes))}; nine in ten of the "
             f"episodes that follow: {yes_no(share >= MOST)}."

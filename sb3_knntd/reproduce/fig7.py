@@ -245,7 +245,7 @@ def verdict(results: Results) -> str:
         changes[algorithm] = [mean_change(actions) for actions in recorded]
         median = f"median {interval(changes[algorithm])}" if recorded else "none"
         sentences.append(
-            f"{NAMES[algorithm]}: {median}, from the {len(recorded)} of {len(by_seed)} seeds that get there."
+            f"{NAMES[algorithm]}: {median}, of the {len(recorded)} of {len(by_seed)} seeds that get there."
         )
     sentences.append("In brackets are the 10 % and 90 % quantiles.")
     if all(changes.values()):

@@ -1,0 +1,446 @@
+"""
+What the δs filter takes out of noisy observations, what it costs, and what it does for learning.
+
+    python -m benchmarks.noise [--seeds 10] [--first-seed 100] [--only TABLE ...] [--json FILE]
+
+Observations have Gaussian noise of 3 % of each dimension's range: that of the observation space where it is finite, and
+-3 to 3 for CartPole's velocities.
+
+``rmse``      error of the estimates over that of the observations, by dimension, while a fixed controller acts on the
+              true state: over the last 10,000 of 60,000 steps. Beside it Algorithm 5 as it stands, and an extended
+              Kalman filter that knows the dynamics and the noise
+``harmless``  returns without noise, with and without the filter: of the same controllers acting on what is returned,
+              and of what is learned from it
+``learning``  returns under noise of what was learned under noise, as shares of the way from random actions to what is
+              learned without noise
+``time``      a step with and without the filter
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3 import DQN
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from benchmarks.machine import describe
+from sb3_knntd import KNNTD, DeltaFilter, ExA, VecDeltaFilter
+
+#: Standard deviation of the noise over a dimension's range.
+NOISE = 0.03
+#: Steps that the filter learns for, and over which its error is then taken.
+LEARNING, EVALUATION = 50_000, 10_000
+#: Settings of Algorithm 5 as it stands.
+ALGORITHM_5 = {"learning_rate": 0.5, "gain": None, "warmup": 0.0}
+EPISODES = 100
+
+
+class NoisyObservation(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
+    """
+    Adds Gaussian noise to observations, and keeps the true ones.
+
+    :param env: environment
+    :param scale: standard deviations, shape (obs_dim,), observation units
+    :param seed: seed of the noise
+    """
+
+    def __init__(self, env: gym.Env[np.ndarray, Any], scale: np.ndarray, seed: int) -> None:
+        super().__init__(env)
+        self.scale = scale
+        self._random = np.random.default_rng(seed)
+        #: the observation without noise
+        self.true = np.zeros(len(scale))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._blur(observation), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict]:
+        observation, *rest = self.env.step(action)
+        return self._blur(observation), *rest  # type: ignore[return-value]
+
+    def _blur(self, observation: np.ndarray) -> np.ndarray:
+        self.true = observation
+        noise = self.scale * self._random.standard_normal(len(self.scale))
+        return (observation + noise).astype(observation.dtype)
+
+
+def drive(observation: np.ndarray) -> int:
+    """Mountain-Car: push the way it moves."""
+    return 2 if observation[1] >= 0 else 0
+
+
+def balance(observation: np.ndarray) -> int:
+    """CartPole: push the way it falls, the cart kept near the middle."""
+    return int(np.dot([0.3, 0.6, 8.0, 1.6], observation) > 0)
+
+
+def swing_up(observation: np.ndarray) -> np.ndarray:
+    """Pendulum: pump energy until it is near the top, then hold it there."""
+    cosine, sine, velocity = observation
+    energy = velocity**2 / 6 + 5 * (cosine - 1)
+    if cosine > 0.85 and abs(velocity) < 3:
+        torque = -12 * np.arctan2(sine, cosine) - 2.5 * velocity
+    elif abs(velocity) < 0.01:
+        torque = 2.0
+    else:
+        torque = -4 * np.sign(velocity) * np.sign(energy) if abs(energy) > 0.3 else 0.0
+    return np.clip([torque], -2, 2).astype(np.float32)
+
+
+def angle_of(observation: np.ndarray) -> np.ndarray:
+    """Pendulum: the state that gives an observation."""
+    return np.array([np.arctan2(observation[1], observation[0]), observation[2]])
+
+
+def cosine_of(state: np.ndarray) -> np.ndarray:
+    """Pendulum: the observation that a state gives."""
+    return np.array([np.cos(state[0]), np.sin(state[0]), state[1]])
+
+
+class Case(NamedTuple):
+    """
+    An environment, and what is known of it.
+
+    :param env_id: environment
+    :param names: of its observation's dimensions
+    :param ranges: of its observation's dimensions, widths
+    :param controller: a competent policy, of the true state
+    :param algorithm: what learns on it
+    :param state: the environment's state that gives an observation
+    :param observe: the observation that a state gives
+    """
+
+    env_id: str
+    names: tuple[str, ...]
+    ranges: tuple[float, ...]
+    controller: Callable[[np.ndarray], Any]
+    algorithm: type[KNNTD] | type[ExA]
+    state: Callable[[np.ndarray], np.ndarray] = np.array
+    observe: Callable[[Any], np.ndarray] = np.array
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Standard deviations of the noise."""
+        return NOISE * np.array(self.ranges)
+
+
+CASES = [
+    Case("MountainCar-v0", ("position", "velocity"), (1.8, 0.14), drive, KNNTD),
+    Case("CartPole-v1", ("position", "velocity", "angle", "angular velocity"), (9.6, 6, 0.8378, 6), balance, KNNTD),
+    Case(
+        "Pendulum-v1",
+        ("cosine", "sine", "angular velocity"),
+        (2, 2, 16),
+        swing_up,
+        ExA,
+        angle_of,
+        cosine_of,
+    ),
+]
+
+
+class KalmanFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
+    """
+    What could be had: an extended Kalman filter that is told the dynamics and the noise. It is not told where the
+    controller keeps the state, which the table learns.
+
+    :param env: noisy environment
+    :param case: what is known of it
+    """
+
+    #: Variance of the process noise over that of the noise, for what linearising leaves out.
+    PROCESS = 1e-4
+    #: Step of the differences that the dynamics are linearised by, over a dimension's range.
+    STEP = 1e-5
+
+    def __init__(self, env: gym.Env[np.ndarray, Any], case: Case) -> None:
+        super().__init__(env)
+        self._case = case
+        self._model: Any = gym.make(case.env_id).unwrapped
+        self._model.reset()
+        self._noise = np.diag(case.scale**2)
+
+    def reset(self, **arguments: Any) -> tuple[np.ndarray, dict]:
+        observation, info = self.env.reset(**arguments)
+        self._estimate, self._covariance = observation.astype(np.float64), self._noise
+        return observation, info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict]:
+        observation, *rest = self.env.step(action)
+        steps = self.STEP * np.diag(self._case.ranges)
+        jacobian = np.array(
+            [
+                (self._next(self._estimate + step, action) - self._next(self._estimate - step, action)) / 2 / step.sum()
+                for step in steps
+            ]
+        ).T
+        covariance = jacobian @ self._covariance @ jacobian.T + self.PROCESS * self._noise
+        gain = covariance @ np.linalg.inv(covariance + self._noise)
+        predicted = self._next(self._estimate, action)
+        self._estimate = predicted + gain @ (observation - predicted)
+        self._covariance = covariance - gain @ covariance
+        return self._estimate, *rest  # type: ignore[return-value]
+
+    def _next(self, observation: np.ndarray, action: Any) -> np.ndarray:
+        self._model.state = self._case.state(observation)
+        self._model.steps_beyond_terminated = None
+        self._model.step(action)
+        return self._case.observe(self._model.state)
+
+
+def estimates(env: gym.Env[np.ndarray, Any], case: Case, seed: int, n_steps: int) -> Iterator[tuple[np.ndarray, ...]]:
+    """
+    Let the controller act on the true state.
+
+    :param env: filter around a :class:`NoisyObservation`
+    :param case: what it is of
+    :param seed: seed of the environment
+    :param n_steps: how many steps
+    :return: of each step the true observation and the estimate
+    """
+    noisy: Any = env.env
+    env.reset(seed=seed)
+    for _ in range(n_steps):
+        estimate, _, terminated, truncated, _ = env.step(case.controller(noisy.true))
+        yield noisy.true, estimate
+        if terminated or truncated:
+            env.reset()
+
+
+def error_ratio(filter_name: str, case: Case, seed: int) -> np.ndarray:
+    """
+    :param filter_name: ``"filter"``, ``"algorithm 5"`` or ``"kalman"``
+    :param case: environment
+    :param seed: seed of environment and noise
+    :return: root mean square error of the estimates over the noise's standard deviation, after learning, (obs_dim,)
+    """
+    noisy = NoisyObservation(gym.make(case.env_id), case.scale, seed)
+    if filter_name == "kalman":
+        pairs = list(estimates(KalmanFilter(noisy, case), case, seed, EVALUATION))
+    else:
+        settings: dict[str, Any] = ALGORITHM_5 if filter_name == "algorithm 5" else {}
+        pairs = list(estimates(DeltaFilter(noisy, **settings), case, seed, LEARNING + EVALUATION))[LEARNING:]
+    true, estimated = np.array(pairs, dtype=np.float64).transpose(1, 0, 2)
+    return np.sqrt(np.square(estimated - true).mean(axis=0)) / case.scale
+
+
+def controller_return(case: Case, seed: int, filtered: bool) -> float:
+    """
+    :param case: environment
+    :param seed: its seed
+    :param filtered: whether the controller acts on what the filter returns
+    :return: mean return of the controller without noise, of the episodes after ``LEARNING`` steps
+    """
+    env = DeltaFilter(gym.make(case.env_id)) if filtered else gym.make(case.env_id)
+    observation, _ = env.reset(seed=seed)
+    returns, total, n_steps = [], 0.0, 0
+    while len(returns) < EPISODES:
+        observation, reward, terminated, truncated, _ = env.step(case.controller(observation))
+        total += float(reward)
+        n_steps += 1
+        if terminated or truncated:
+            observation, _ = env.reset()
+            if n_steps >= LEARNING:
+                returns.append(total)
+            total = 0.0
+    return float(np.mean(returns))
+
+
+def make_noisy(case: Case, n_envs: int, seed: int, noise: bool) -> VecEnv:
+    """
+    :param case: environment
+    :param n_envs: how many
+    :param seed: of environments and noise
+    :param noise: whether there is any
+    :return: the environments
+    """
+    if not noise:
+        return make_vec_env(case.env_id, n_envs, seed=seed)
+    seeds = iter(range(1000 * seed, 1000 * seed + n_envs))
+    return make_vec_env(
+        case.env_id, n_envs, seed=seed, wrapper_class=lambda env: NoisyObservation(env, case.scale, next(seeds))
+    )
+
+
+def learned_return(case: Case, seed: int, noise: bool, filtered: bool, algorithm: str | None) -> float:
+    """
+    :param case: environment
+    :param seed: seed of everything
+    :param noise: whether observations have noise, in training and evaluation
+    :param filtered: whether they are filtered, in training and evaluation
+    :param algorithm: ``"KNNTD"``, ``"ExA"``, ``"DQN"`` or ``"random"``, with its defaults
+    :return: mean return of what was learned in ``LEARNING`` steps
+    """
+    th.set_num_threads(1)
+    venv, evaluation = make_noisy(case, 1, seed, noise), make_noisy(case, 10, 10_000 + seed, noise)
+    if filtered:
+        venv = VecDeltaFilter(venv)
+        evaluation = venv.for_evaluation(evaluation)
+    if algorithm == "random":
+        evaluation.action_space.seed(seed)
+        return _random_return(evaluation)
+    kinds: dict[str, Any] = {"KNNTD": KNNTD, "ExA": ExA, "DQN": lambda env, seed: DQN("MlpPolicy", env, seed=seed)}
+    assert algorithm is not None
+    model: BaseAlgorithm = kinds[algorithm](venv, seed=seed)
+    model.learn(LEARNING)
+    mean, _ = evaluate_policy(model, evaluation, n_eval_episodes=EPISODES, deterministic=True)
+    assert isinstance(mean, float)
+    return mean
+
+
+def _random_return(venv: VecEnv) -> float:
+    returns: list[float] = []
+    venv.reset()
+    while len(returns) < EPISODES:
+        _, _, _, infos = venv.step(np.array([venv.action_space.sample() for _ in range(venv.num_envs)]))
+        returns += [info["episode"]["r"] for info in infos if "episode" in info]
+    return float(np.mean(returns))
+
+
+def step_times(case: Case, seed: int) -> tuple[float, float]:
+    """
+    :param case: environment
+    :param seed: its seed
+    :return: seconds that a step takes without and with the filter, in a DummyVecEnv, the least of several times
+    """
+    times: list[list[float]] = [[], []]
+    venvs = [DummyVecEnv([lambda: gym.make(case.env_id)]) for _ in range(2)]
+    venvs[1] = VecDeltaFilter(venvs[1])
+    for venv in venvs:
+        venv.seed(seed)
+        venv.reset()
+    action = np.array([venvs[0].action_space.sample()])
+    for _ in range(10):
+        for index, venv in enumerate(venvs):
+            begin = time.perf_counter()
+            for _ in range(1000):
+                venv.step(action)
+            times[index].append((time.perf_counter() - begin) / 1000)
+    return min(times[0]), min(times[1])
+
+
+def spread(figures: list[float]) -> str:
+    """
+    :param figures: one of each seed
+    :return: their median, and 10 % and 90 % quantiles
+    """
+    low, median, high = np.quantile(figures, (0.1, 0.5, 0.9))
+    return f"{median:.3g} ({low:.3g} to {high:.3g})"
+
+
+Row = dict[str, Any]
+
+
+def rmse_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
+    """Print and return the table ``rmse``; ``pool`` runs the seeds, as in the tables below."""
+    print("| environment | dimension | noise | filter | Algorithm 5 | Kalman filter, dynamics known |")
+    print("|---|---|---|---|---|---|")
+    rows = []
+    for case in CASES:
+        figures = {
+            name: np.array(list(pool.map(error_ratio, [name] * len(seeds), [case] * len(seeds), seeds)))
+            for name in ("filter", "algorithm 5", "kalman")
+        }
+        for dimension, name in enumerate(case.names):
+            columns = " | ".join(spread(ratios[:, dimension]) for ratios in figures.values())
+            print(f"| {case.env_id} | {name} | {case.scale[dimension]:.3g} | {columns} |", flush=True)
+        rows.append({"environment": case.env_id, **{name: ratios.tolist() for name, ratios in figures.items()}})
+    return rows
+
+
+def harmless_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
+    """Print and return the table ``harmless``."""
+    print("| environment | who acts | without filter | with filter |\n|---|---|---|---|")
+    rows = []
+    n = len(seeds)
+    for case in CASES:
+        algorithm = case.algorithm.__name__
+        for who in ("controller", algorithm):
+            figures = [
+                list(pool.map(controller_return, [case] * n, seeds, [filtered] * n))
+                if who == "controller"
+                else list(pool.map(learned_return, [case] * n, seeds, [False] * n, [filtered] * n, [algorithm] * n))
+                for filtered in (False, True)
+            ]
+            print(f"| {case.env_id} | {who} | {spread(figures[0])} | {spread(figures[1])} |", flush=True)
+            rows.append({"environment": case.env_id, "who": who, "without": figures[0], "with": figures[1]})
+    return rows
+
+
+def learning_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
+    """Print and return the table ``learning``."""
+    print("| environment | algorithm | no noise | noise | noise, filter | share with filter | share without |")
+    print("|---|---|---|---|---|---|---|")
+    rows = []
+    n = len(seeds)
+    for case in CASES[:2]:
+        chance = list(
+            pool.map(learned_return, [case] * n, seeds, [False] * n, [False] * n, ["random"] * n),
+        )
+        for algorithm in ("KNNTD", "DQN"):
+            figures = [
+                list(pool.map(learned_return, [case] * n, seeds, [noise] * n, [filtered] * n, [algorithm] * n))
+                for noise, filtered in ((False, False), (True, False), (True, True))
+            ]
+            low, high, *reached = (statistics.median(returns) for returns in (chance, *figures))
+            shares = [f"{(value - low) / (high - low):.0%}" if high > low else "" for value in reached[::-1]]
+            print(
+                f"| {case.env_id} | {algorithm} | {' | '.join(map(spread, figures))} | {' | '.join(shares)} |",
+                flush=True,
+            )
+            rows.append({"environment": case.env_id, "algorithm": algorithm, "random": chance, "returns": figures})
+    return rows
+
+
+def time_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
+    """Print and return the table ``time``."""
+    print("| environment | without, µs | with, µs |\n|---|---|---|")
+    rows = []
+    for case in CASES:
+        bare, filtered = pool.submit(step_times, case, seeds[0]).result()
+        print(f"| {case.env_id} | {1e6 * bare:.1f} | {1e6 * filtered:.1f} |", flush=True)
+        rows.append({"environment": case.env_id, "without": bare, "with": filtered})
+    return rows
+
+
+TABLES = {"rmse": rmse_table, "harmless": harmless_table, "learning": learning_table, "time": time_table}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=10, help="number of seeds")
+    parser.add_argument("--first-seed", type=int, default=100, help="the defaults were chosen on others")
+    parser.add_argument("--workers", type=int, help="number of processes")
+    parser.add_argument("--only", nargs="+", choices=TABLES, metavar="TABLE", help=", ".join(TABLES))
+    parser.add_argument("--json", metavar="FILE", help="also store every seed's figure")
+    arguments = parser.parse_args()
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    stored = {}
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        for name in arguments.only or TABLES:
+            stored[name] = TABLES[name](pool, seeds)
+            print()
+    print(
+        f"Seeds {seeds[0]} to {seeds[-1]}, medians (10 % to 90 %). "
+        + ", ".join(f"{key} {value}" for key, value in describe().items())
+    )
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump({"machine": describe(), "tables": stored}, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

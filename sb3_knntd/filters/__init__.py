@@ -1,0 +1,8 @@
+"""The δs filter (Algorithm 5 of the paper): noisy observations in, estimates of the state out."""
+
+from __future__ import annotations
+
+from sb3_knntd.filters.gym_filter import DeltaFilter
+from sb3_knntd.filters.vec_filter import VecDeltaFilter
+
+__all__ = ["DeltaFilter", "VecDeltaFilter"]

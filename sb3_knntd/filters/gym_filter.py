@@ -1,0 +1,182 @@
+"""The δs filter around a gymnasium environment."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+
+from sb3_knntd.filters.observer import Observer
+from sb3_knntd.filters.saving import load_table, save_table
+from sb3_knntd.filters.table import Arguments, DeltaTable
+
+
+class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs):
+    """
+    Takes noise out of observations by learning how the state changes: the k-NN δs filter (Algorithm 5 of the paper),
+    with a gain that adapts to the noise.
+
+    It learns δ(s, a), the expected change of the state, in a table over perception points (eqs. 28 and 31 to 33). A
+    step predicts s + δ(s, a) from the last estimate s, compares that with what is observed, and returns the prediction
+    plus a gain times that difference, the innovation. With ``learning_rate=0.5, gain=None, warmup=0`` it is
+    Algorithm 5 itself.
+
+    An episode begins with the raw observation. ``info["raw_observation"]`` is what came in. Estimates can lie a little
+    outside of the observation space's bounds.
+
+    .. code-block:: python
+
+        env = DeltaFilter(env)
+        model = KNNTD(env).learn(50_000)
+        env.training = False
+
+    :param env: environment with observations in a Box of shape (n,), and Discrete or Box actions
+    :param learning_rate: ``"count"``: one over the visits of an entry, down to 0.001, so that it is the mean of what
+        was seen there; α in [0, 1]; or a function of the remaining progress (from 1 to 0)
+    :param update: ``"averaging"``: each entry moves towards the change that was seen; ``"gradient"``: all neighbours
+        move by the error of their weighted mean; ``None`` is averaging with ``"count"``, and gradient otherwise
+    :param reference: what changes are measured and predicted from: the last ``"filtered"`` state or the last
+        ``"observed"`` one
+    :param gain: what the innovation is multiplied by: ``"adaptive"``, by dimension from the correlation of successive
+        innovations, which a steady-state Kalman filter would leave without (Mehra, "On the identification of variances
+        and adaptive Kalman filtering", 1970); a number in (0, 1], or one a dimension; ``None``: the update of the table
+        alone corrects the estimate, as in Algorithm 5
+    :param warmup: visits, each shared among the neighbours as they count, that the neighbours of a state must have for
+        the action, in their weighted mean, for their prediction to be trusted; until then the raw observation passes
+    :param n_neighbors: k >= 1; ``"auto"`` is 2 obs_dim + 1
+    :param points: see :class:`~sb3_knntd.KNNTD`; ``"auto"`` is a lattice of about 2000 points, at most 20 a dimension
+    :param bounds: see :class:`~sb3_knntd.KNNTD`; the range of dimensions without one is measured over the first 1000
+        observations (100 of each environment), which pass as they are
+    :param weights: see :class:`~sb3_knntd.KNNTD`
+    :param bandwidth: see :class:`~sb3_knntd.KNNTD`
+    :param search: see :class:`~sb3_knntd.KNNTD`
+    :param action_points: for Box actions, whose nearest point stands for them: an int >= 2 or one int a dimension for
+        evenly spaced points, or rising arrays, one a dimension, in action units
+    :param total_timesteps: over how many steps a schedule of the learning rate goes
+    :param training: whether to learn; can be set at any time
+    :param compiled: whether to use the compiled step where it can be used: with numba, and weights that are no function
+    :raises ValueError: if an argument or a space does not fit; the message says which, and what would
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[np.ndarray, Any],
+        learning_rate: float | str | Callable[[float], float] = "count",
+        update: str | None = None,
+        reference: str = "filtered",
+        gain: Any = "adaptive",
+        warmup: float = 1.0,
+        n_neighbors: int | str = "auto",
+        points: Any = "auto",
+        bounds: Any = None,
+        weights: str | Callable[[th.Tensor], Any] = "inverse_quadratic",
+        bandwidth: float = 1.0,
+        search: str = "auto",
+        action_points: Any = 5,
+        total_timesteps: int | None = None,
+        training: bool = True,
+        compiled: bool = True,
+    ) -> None:
+        arguments = Arguments(
+            learning_rate=learning_rate,
+            update=update,
+            reference=reference,
+            gain=gain,
+            warmup=warmup,
+            n_neighbors=n_neighbors,
+            points=points,
+            bounds=bounds,
+            weights=weights,
+            bandwidth=bandwidth,
+            search=search,
+            action_points=action_points,
+            total_timesteps=total_timesteps,
+            compiled=compiled,
+        )
+        gym.utils.RecordConstructorArgs.__init__(self, **arguments._asdict(), training=training)
+        gym.Wrapper.__init__(self, env)
+        self._set_up(DeltaTable(env.observation_space, env.action_space, arguments), training)
+
+    def _set_up(self, table: DeltaTable, training: bool) -> None:
+        #: what is learned
+        self.table = table
+        #: whether to learn
+        self.training = training
+        self._observer = Observer(table, 1)
+        self._dtype = table.observation_space.dtype
+        self._raw_observation: np.ndarray | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """
+        :param seed: see :meth:`gymnasium.Env.reset`
+        :param options: see :meth:`gymnasium.Env.reset`
+        :return: the observation as it is, and info with ``raw_observation``
+        :raises ValueError: if the observation is not finite
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._observer.begin([0], np.asarray(observation)[None])
+        self._raw_observation = observation
+        return observation, {**info, "raw_observation": observation}
+
+    def step(self, action: Any) -> tuple[np.ndarray, SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        :param action: see :meth:`gymnasium.Env.step`
+        :return: as the environment does, with the estimated state for an observation, and ``raw_observation`` in info
+        :raises ValueError: if the observation is not finite; nothing is learned from it
+        """
+        columns = self.table.columns(np.asarray(action)[None])
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        filtered = self._observer.advance(np.asarray(observation)[None], columns, self.training)[0]
+        self._raw_observation = observation
+        info = {**info, "raw_observation": observation}
+        return filtered.astype(self._dtype), reward, terminated, truncated, info
+
+    def get_original_obs(self) -> np.ndarray:
+        """
+        :return: the last observation as it came in, shape (obs_dim,)
+        :raises ValueError: if there is none yet
+        """
+        if self._raw_observation is None:
+            raise ValueError("there is no observation yet: call reset first")
+        return np.array(self._raw_observation)
+
+    def for_evaluation(self, env: gym.Env[np.ndarray, Any]) -> DeltaFilter:
+        """
+        :param env: another environment with the same spaces
+        :return: a filter around it that uses what this one has learned and goes on learning, and learns nothing itself
+        :raises ValueError: if the spaces are others
+        """
+        self.table.check_spaces(env.observation_space, env.action_space)
+        return self._around(env, self.table, training=False)
+
+    def save(self, path: str | pathlib.Path) -> None:
+        """
+        Save parameters and all that was learned; where the environment is now is not saved.
+
+        :param path: file, with ``.zip`` added if it has no suffix
+        """
+        save_table(path, self.table, self.training)
+
+    @classmethod
+    def load(cls, path: str | pathlib.Path, env: gym.Env[np.ndarray, Any]) -> DeltaFilter:
+        """
+        :param path: file that a :class:`DeltaFilter` or a :class:`VecDeltaFilter` has saved
+        :param env: the environment to filter
+        :return: the filter as it was
+        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``env`` has
+        """
+        return cls._around(env, *load_table(path, env.observation_space, env.action_space))
+
+    @classmethod
+    def _around(cls, env: gym.Env[np.ndarray, Any], table: DeltaTable, training: bool) -> DeltaFilter:
+        around = cls.__new__(cls)
+        gym.utils.RecordConstructorArgs.__init__(around, **table.arguments._asdict(), training=training)
+        gym.Wrapper.__init__(around, env)
+        around._set_up(table, training)
+        return around

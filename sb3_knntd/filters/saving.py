@@ -1,0 +1,65 @@
+"""A filter as a file."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from typing import Any
+
+from gymnasium import spaces
+from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
+
+from sb3_knntd.base import _read_data
+from sb3_knntd.files import replace_file
+from sb3_knntd.filters.table import Arguments, DeltaTable
+
+#: What a file says that it holds.
+CONTENT = "sb3_knntd filter"
+
+
+def save_table(path: str | pathlib.Path, table: DeltaTable, training: bool) -> None:
+    """
+    Save what a filter has learned, and its parameters. It is written beside the old file and renamed, so that
+    whatever interrupts it leaves a whole file.
+
+    :param path: file, with ``.zip`` added if it has no suffix
+    :param table: what was learned
+    :param training: whether it was learning
+    """
+    target = pathlib.Path(path)
+    if not target.suffix:
+        target = target.with_name(f"{target.name}.zip")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    data = {
+        "content": CONTENT,
+        "arguments": table.arguments._asdict(),
+        "observation_space": table.observation_space,
+        "action_space": table.action_space,
+        "bounds_from_space": table.bounds_from_space,
+        "training": training,
+    }
+    file = io.BytesIO()
+    save_to_zip_file(file, data, {"filter": table.state_dict()})
+    replace_file(target, file.getvalue())
+
+
+def load_table(
+    path: str | pathlib.Path, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> tuple[DeltaTable, bool]:
+    """
+    :param path: file
+    :param observation_space: of the environment to be filtered
+    :param action_space: likewise
+    :return: what was learned, and whether it was learning
+    :raises ValueError: if the file is damaged, holds something else, or is of other spaces
+    """
+    if _read_data(path).get("content") != CONTENT:
+        raise ValueError(f"{path} holds no filter. Models are loaded by their own class, e.g. KNNTD.load")
+    data, params, _ = load_from_zip_file(path, device="cpu")
+    assert data is not None
+    saved = data["observation_space"], data["action_space"]
+    table = DeltaTable(*saved, Arguments(**data["arguments"]), data["bounds_from_space"])
+    table.check_spaces(observation_space, action_space)
+    state: dict[str, Any] = params["filter"]  # type: ignore[assignment]
+    table.load_state_dict(state)
+    return table, data["training"]

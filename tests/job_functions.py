@@ -1,0 +1,50 @@
+"""What the jobs of the tests compute, importable by the processes that compute it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+
+def square(number: int, log: str) -> dict[str, Any]:
+    """Leave a line in the log for each time it is computed."""
+    with open(log, "a") as file:
+        file.write(f"{number}\n")
+    return {"square": number**2, "pair": (number, number)}
+
+
+def threads() -> dict[str, Any]:
+    """How many threads libraries take, and who computes."""
+    import torch
+
+    return {"torch": torch.get_num_threads(), "openmp": os.environ["OMP_NUM_THREADS"], "process": os.getpid()}
+
+
+def fail(what: str) -> None:
+    """Raise."""
+    raise ValueError(f"there is no {what}")
+
+
+def unstorable() -> object:
+    """What JSON cannot hold."""
+    return object()
+
+
+def die(marker: str, times: int) -> str:
+    """Be killed so many times, then return."""
+    path = Path(marker)
+    attempts = int(path.read_text()) if path.exists() else 0
+    path.write_text(str(attempts + 1))
+    if attempts < times:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return f"alive after {attempts}"
+
+
+def slow(seconds: float, folder: str) -> int:
+    """Tell which process is at it, and take some time."""
+    Path(folder, f"started-{os.getpid()}").touch()
+    time.sleep(seconds)
+    return os.getpid()

@@ -1,0 +1,74 @@
+"""TensorBoard, as a user sees it: a run of each algorithm, in a browser."""
+
+from __future__ import annotations
+
+import importlib
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def screenshots() -> Iterator[Any]:
+    """The script that makes the pictures of the documentation."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "docs"))
+        module = importlib.import_module("screenshots")
+        if module.find_chromium() is None:
+            pytest.skip(f"no browser to look with: none of {', '.join(module.CHROMIUM)} is on the PATH")
+        yield module
+
+
+@pytest.fixture(scope="module")
+def board(screenshots: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Any]]:
+    """TensorBoard's address and a page of a browser, on short runs of both algorithms with all callbacks."""
+    logs = screenshots.train(tmp_path_factory.mktemp("runs"), n_steps=2000, n_pictures=1)
+    with screenshots.open_tensorboard(logs) as opened:
+        yield opened
+
+
+RUNS = ["KNNTD_1", "ExA_1"]
+
+
+def test_scalars_are_shown(screenshots: Any, board: tuple[str, Any], tmp_path: pathlib.Path) -> None:
+    url, page = board
+    screenshots.show(page, url, "scalars")
+    headings = page.locator("tf-card-heading").all_inner_texts()
+    for tag in screenshots.SCALARS:
+        assert any(tag in heading for heading in headings), tag
+    for run in RUNS:
+        assert page.get_by_text(run, exact=True).first.is_visible()
+    # Two runs, two curves: without data a chart has none.
+    chart = page.locator("tf-scalar-card").filter(has_text="perception/visited_share")
+    assert chart.locator("circle").count() >= len(RUNS)
+
+
+def test_images_are_shown(screenshots: Any, board: tuple[str, Any]) -> None:
+    url, page = board
+    screenshots.show(page, url, "images")
+    for tag in screenshots.IMAGES:
+        cards = page.locator("tf-image-loader", has_text=tag)
+        assert cards.count() == len(RUNS)
+        for card in cards.all():
+            assert card.get_by_text("2,000").first.is_visible()
+            width, height = card.locator("img").first.evaluate("image => [image.naturalWidth, image.naturalHeight]")
+            assert width > 200
+            assert height > 100
+
+
+def test_hparams_are_shown(screenshots: Any, board: tuple[str, Any]) -> None:
+    url, page = board
+    screenshots.show(page, url, "hparams")
+    for run in RUNS:
+        assert page.get_by_text(run, exact=True).first.is_visible()
+    for name in ("algorithm", "env", "gamma", "learning_rate", "n_neighbors", "trace_decay", "action_points"):
+        assert page.get_by_text(name, exact=True).first.is_visible(), name
+    for metric in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "train/td_error", "time/fps"):
+        assert page.get_by_text(metric, exact=True).count() > 0, metric
+    # Mountain-Car's first episodes last 200 steps, at -1 each.
+    row = page.locator("vaadin-grid-cell-content", has_text="-200.00")
+    assert row.first.is_visible()
