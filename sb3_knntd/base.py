@@ -573,7 +573,9 @@ class KNNAlgorithm(BaseAlgorithm):
             )
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         if model.n_envs != saved["n_envs"]:
-            model._last_obs = model._last_actions = None
+            model._last_obs = None
+        if not model.learner.in_episodes:
+            model._last_actions = None
         # A seed that is given begins new sequences; without one the saved ones go on.
         if kwargs.get("seed") is None:
             for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):

@@ -90,6 +90,7 @@ class CompiledLearner(Learner):
         seen = as_rows(observations)
         self._find(seen, kernel.NOW)
         kernel.begin(self._desk, seen, self.stream.next()[:, 0], rate)
+        self.in_episodes = True
         return self._actions
 
     def learn(
@@ -148,7 +149,8 @@ class CompiledLearner(Learner):
 
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
         self.live.forget()
-        if len(state_dict["indices"]) == self.n_envs:
+        self.in_episodes = state_dict["entries"].shape == self._entries[kernel.NOW].shape
+        if self.in_episodes:
             self._indices[kernel.NOW] = state_dict["indices"].numpy()
             self._probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
             self._entries[kernel.NOW] = state_dict["entries"].numpy()

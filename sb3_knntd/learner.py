@@ -42,6 +42,8 @@ class Learner(ABC):
     """
 
     n_envs: int
+    #: whether it holds where the episodes are
+    in_episodes = False
 
     @abstractmethod
     def begin(self, observations: np.ndarray, rate: float) -> np.ndarray:
@@ -97,8 +99,8 @@ class Learner(ABC):
     @abstractmethod
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
         """
-        Take over the state of a learner of the same table. One of another number of environments holds no
-        episode of these, and is left.
+        Take over the state of a learner of the same table. One of another number of environments or neighbours
+        holds no episode of these, and is left.
 
         :param state_dict: what :meth:`state_dict` returned
         :param strict: part of torch's signature; a state is always taken whole
@@ -246,7 +248,8 @@ class TorchLearner(Learner):
 
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
         self.traces.clear()
-        if len(state_dict["indices"]) != self.n_envs:
+        self.in_episodes = state_dict["entries"].shape == self.entries.shape
+        if not self.in_episodes:
             return
         for name in ("indices", "probabilities", "entries", "held"):
             getattr(self, name).copy_(state_dict[name])
@@ -272,6 +275,7 @@ class TorchLearner(Learner):
         return self.rule.value(self.table.rows(self.indices), self.probabilities, self.entries)
 
     def _settle_in(self, perception: Perception, choice: Choice) -> np.ndarray:
+        self.in_episodes = True
         self.indices.copy_(perception.indices)
         self.probabilities.copy_(perception.probabilities)
         self.entries.copy_(choice.entries)

@@ -490,3 +490,17 @@ def test_refused_file_leaves_the_file(saved: pathlib.Path) -> None:
     with pytest.raises(ValueError, match="space"):
         KNNTD.load(saved, env=gym.make("Acrobot-v1"))
     check_untouched(saved, before)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_another_number_of_neighbours_can_be_given_when_loading(tmp_path: pathlib.Path, compiled: bool) -> None:
+    """The table is the same; where the episodes were is not, and they begin anew."""
+    arguments: dict[str, Any] = {"points": (9, 9), "policy_kwargs": {"compiled": compiled}, "seed": 0}
+    KNNTD("MountainCar-v0", n_neighbors=4, **arguments).learn(300).save(tmp_path / "four")
+    venv = make_vec_env("MountainCar-v0", seed=0)
+    for force_reset in (True, False):
+        model = KNNTD.load(tmp_path / "four", env=venv, n_neighbors=7, force_reset=force_reset)
+        assert th.equal(model.policy.q_table, KNNTD.load(tmp_path / "four").policy.q_table)
+        model.learn(100, reset_num_timesteps=False)
+        assert model.num_timesteps == 400
+        assert model.policy.perceive(np.zeros(2)).indices.shape == (1, 7)
