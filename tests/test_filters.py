@@ -252,6 +252,30 @@ def test_the_adapted_gain_is_that_of_a_kalman_filter(steps: tuple[float, float])
     np.testing.assert_allclose(np.mean(gains[10_000:], axis=0), predicted / (predicted + 1), rtol=0, atol=0.05)
 
 
+def test_an_episode_begins_with_the_doubt_of_one_observation() -> None:
+    env = DeltaFilter(Linear((0.01, 0.01)), points=1, n_neighbors=1)
+    env.reset()
+    for _ in range(5000):
+        env.step(0)
+    assert (env.table.gains < 0.2).all()
+    env.training = False
+    first, _ = env.reset()
+    seen = [first]
+    for step in range(2, 6):
+        estimate, _, _, _, info = env.step(0)
+        seen.append(info["raw_observation"])
+        # All but the mean of so many observations, as long as the state has hardly moved.
+        np.testing.assert_allclose(estimate, np.mean(seen, axis=0), rtol=0, atol=0.25)
+        assert len(seen) == step
+
+
+def test_innovations_of_two_episodes_are_not_taken_for_successive() -> None:
+    venv = VecDeltaFilter(make_venv(2, lengths=(1,)), **PERCEPTION)
+    walk(venv, 300)
+    assert venv.table.counts[0] > 100
+    np.testing.assert_array_equal(venv.table.gains, 1.0)
+
+
 @pytest.fixture
 def noise(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The benchmark, which is run from the root of the repository and not installed."""
