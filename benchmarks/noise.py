@@ -9,6 +9,7 @@ Observations have Gaussian noise of 3 % of each dimension's range: that of the o
 ``rmse``      error of the estimates over that of the observations, by dimension, while a fixed controller acts on the
               true state: over the last 10,000 of 60,000 steps. Beside it Algorithm 5 as it stands, and an extended
               Kalman filter that knows the dynamics and the noise
+``soon``      the same after fewer steps
 ``harmless``  returns without noise, with and without the filter: of the same controllers acting on what is returned,
               and of what is learned from it
 ``learning``  returns under noise of what KNNTD learned under noise, also as shares of the way from random actions to
@@ -44,6 +45,8 @@ from sb3_knntd import KNNTD, DeltaFilter, ExA, VecDeltaFilter
 NOISE = 0.03
 #: Steps that the filter learns for, and over which its error is then taken.
 LEARNING, EVALUATION = 50_000, 10_000
+#: The same, of the table ``soon``.
+SOON = (0, 5_000, 10_000, 20_000)
 #: Settings of Algorithm 5 as it stands.
 ALGORITHM_5 = {"learning_rate": 0.5, "gain": None, "warmup": 0.0}
 EPISODES = 100
@@ -227,11 +230,12 @@ def estimates(env: gym.Env[np.ndarray, Any], case: Case, seed: int, n_steps: int
             env.reset()
 
 
-def error_ratio(filter_name: str, case: Case, seed: int) -> np.ndarray:
+def error_ratio(filter_name: str, case: Case, seed: int, learning: int = LEARNING) -> np.ndarray:
     """
     :param filter_name: ``"filter"``, ``"algorithm 5"`` or ``"kalman"``
     :param case: environment
     :param seed: seed of environment and noise
+    :param learning: how many steps the filter learns for before
     :return: root mean square error of the estimates over the noise's standard deviation, after learning, (obs_dim,)
     """
     noisy = NoisyObservation(gym.make(case.env_id), case.scale, seed)
@@ -239,7 +243,7 @@ def error_ratio(filter_name: str, case: Case, seed: int) -> np.ndarray:
         pairs = list(estimates(KalmanFilter(noisy, case), case, seed, EVALUATION))
     else:
         settings: dict[str, Any] = ALGORITHM_5 if filter_name == "algorithm 5" else {}
-        pairs = list(estimates(DeltaFilter(noisy, **settings), case, seed, LEARNING + EVALUATION))[LEARNING:]
+        pairs = list(estimates(DeltaFilter(noisy, **settings), case, seed, learning + EVALUATION))[learning:]
     true, estimated = np.array(pairs, dtype=np.float64).transpose(1, 0, 2)
     return np.sqrt(np.square(estimated - true).mean(axis=0)) / case.scale
 
@@ -369,6 +373,24 @@ def rmse_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
     return rows
 
 
+def soon_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
+    """Print and return the table ``soon``."""
+    print(f"| environment | dimension | {' | '.join(f'{learning:,}' for learning in SOON)} |")
+    print("|---|---|" + "---|" * len(SOON))
+    rows = []
+    n = len(seeds)
+    for case in CASES:
+        figures = [
+            np.array(list(pool.map(error_ratio, ["filter"] * n, [case] * n, seeds, [learning] * n)))
+            for learning in SOON
+        ]
+        for dimension, name in enumerate(case.names):
+            columns = " | ".join(spread(ratios[:, dimension]) for ratios in figures)
+            print(f"| {case.env_id} | {name} | {columns} |", flush=True)
+        rows.append({"environment": case.env_id, "filter": [ratios.tolist() for ratios in figures]})
+    return rows
+
+
 def harmless_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
     """Print and return the table ``harmless``."""
     print("| environment | who acts | without filter | with filter |\n|---|---|---|---|")
@@ -425,6 +447,7 @@ def time_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
 
 TABLES: dict[str, Callable[[ProcessPoolExecutor, range], list[Row]]] = {
     "rmse": rmse_table,
+    "soon": soon_table,
     "harmless": harmless_table,
     "learning": partial(learning_table, algorithm="KNNTD"),
     "dqn": partial(learning_table, algorithm="DQN"),
