@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import io
 import multiprocessing
 import os
@@ -37,7 +38,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecEnv, V
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy_envs import DriftEnv, GridEnv, RecordingVecEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, VecDeltaFilter
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.plots import figure_of, value_grid
 
@@ -219,6 +220,18 @@ def test_nothing_is_done_twice_at_the_end(make_model: MakeModel, tmp_path: pathl
     # No step, no picture.
     model.learn(0, callback=callback, reset_num_timesteps=False)
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == times
+
+
+def test_the_benchmark_measures_every_callback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parent.parent))
+    benchmark = importlib.import_module("benchmarks.callbacks")
+    monkeypatch.setattr(benchmark, "STEPS", 200)
+    step, (least, *rows) = benchmark.measure(seconds=1.0, repeats=1)
+    assert [row.name for row in rows] == list(benchmark.make_callbacks(pathlib.Path("nowhere")))
+    assert step > 0
+    assert all(0 < row.call < 1000 for row in [least, *rows])
+    acted = {row.name: row.act for row in rows}
+    assert acted["PerceptionStatsCallback"] > 0
 
 
 # -------------------------------------------------------------------- value map
@@ -615,6 +628,17 @@ def test_resume_wraps_a_bare_environment(make_model: MakeModel, make_venv: MakeV
         np.testing.assert_array_equal(outer.venv.obs_rms.mean, model.get_env().venv.obs_rms.mean)  # type: ignore[union-attr]
         resumed.learn(50, reset_num_timesteps=False)
         assert resumed.num_timesteps == 150
+
+
+def test_resume_brings_back_what_a_filter_has_learned(make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+    model = KNNTD(VecDeltaFilter(make_venv(2)), points=5, n_neighbors=3, seed=0)
+    model.learn(300, callback=TableCheckpointCallback(tmp_path))
+    resumed = TableCheckpointCallback.resume(tmp_path, make_venv(2))
+    known, learned = resumed.get_env(), model.get_env()
+    assert isinstance(known, VecDeltaFilter)
+    assert isinstance(learned, VecDeltaFilter)
+    th.testing.assert_close(known.table.state_dict(), learned.table.state_dict(), rtol=0, atol=0)
+    resumed.learn(100, reset_num_timesteps=False)
 
 
 @pytest.mark.parametrize("cls", [KNNTD, ExA])
