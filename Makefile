@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint type format clean
+.PHONY: help demo test lint type format docs linkcheck clean
 
 help:  ## Show what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/' | column -t -s ':'
@@ -33,5 +33,11 @@ format: $(VENV)/installed  ## Put code into the project's format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+docs: $(VENV)/installed  ## Build the documentation, docs/_build/html/index.html
+	$(BIN)/python -m sphinx -W --keep-going docs docs/_build/html
+
+linkcheck: $(VENV)/installed  ## Check the documentation's links to other sites
+	$(BIN)/python -m sphinx -b linkcheck docs docs/_build/linkcheck
+
 clean:  ## Remove what set-up and runs have made
-	rm -rf $(VENV) build dist demo *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist demo docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-#: Observations kept before they are counted: counting many at once takes a hundredth of the time.
+#: Steps kept before they are counted: counting many at once takes a hundredth of the time.
 BUFFERED = 1024
-#: An episode is kept from the last so many buffers on.
+#: Of a longer episode the last so many times that are kept.
 LONGEST_ROUTE = 10
 
 Extent = tuple[float, float, float, float]
@@ -32,15 +32,16 @@ class Footprints:
         self.counts = np.zeros((resolution, resolution), np.int64)
         #: observations of the episodes that have ended, the last one among them, shape (n_steps, obs_dim), latest last
         self.routes: deque[np.ndarray] = deque(maxlen=n_routes)
-        self._extent: Extent | None = None
+        #: what the environments showed after each step since :meth:`count`, shape (n_envs, obs_dim); to be appended to
+        self.recent: list[np.ndarray] = []
+        self._ends: list[tuple[int, np.ndarray]] = []
         self._route: deque[np.ndarray] = deque(maxlen=LONGEST_ROUTE)
-        self._buffer = np.empty((0, 0, 0))
-        self._n_buffered = self._route_start = 0
+        self._extent: Extent | None = None
 
     @property
     def room(self) -> int:
-        """How often something can be added before :meth:`count` has to be called."""
-        return len(self._buffer) - self._n_buffered
+        """How many steps may be appended before :meth:`count` ought to be called."""
+        return BUFFERED - len(self.recent)
 
     def begin(self, observations: np.ndarray) -> None:
         """
@@ -48,54 +49,66 @@ class Footprints:
 
         :param observations: where the environments are, shape (n_envs, obs_dim)
         """
-        n_envs, obs_dim = observations.shape
-        self._buffer = np.empty((max(16, BUFFERED // n_envs), n_envs, obs_dim), observations.dtype)
-        self._n_buffered = self._route_start = 0
         self._route.clear()
-        self._route.append(observations[:1].copy())
-
-    def add(self, observations: np.ndarray) -> None:
-        """
-        :param observations: what the environments show after a step, shape (n_envs, obs_dim)
-        """
-        self._buffer[self._n_buffered] = observations
-        self._n_buffered += 1
+        self._route.append(observations[:1])
 
     def end_route(self, last_observation: np.ndarray) -> None:
         """
-        The episode of the first environment has ended, and what it shows now has not been added yet.
+        The episode of the first environment has ended, and what it shows now has not been appended yet.
 
         :param last_observation: the last of the episode, shape (obs_dim,)
         """
-        self._keep_route()
-        self.routes.append(np.concatenate([*self._route, last_observation[None]]))
-        self._route.clear()
+        self._ends.append((len(self.recent), last_observation))
 
     def count(self, extent: Extent) -> None:
         """
-        Count what was added since. If the range is another than before, what was counted in that is dropped.
+        Count what was appended since. If the range has changed, what was counted moves over, cell by cell.
 
         :param extent: (left, right, bottom, top), the range of the cells
         """
-        if extent != self._extent:
-            self.counts[:] = 0
-            self._extent = extent
-        self._keep_route()
+        if self._extent not in (None, extent):
+            self._move_to(extent)
+        self._extent = extent
+        if not self.recent:
+            return
+        # What np.stack does, in a third of its time.
+        observations = np.concatenate(self.recent).reshape(len(self.recent), *self.recent[0].shape)
+        self._follow(observations[:, 0])
+        places = observations[..., list(self.dims)].reshape(-1, 2)
+        self.counts += self._histogram(places, np.ones(len(places), np.int64), extent)
+        self.recent.clear()
+
+    def _follow(self, observations: np.ndarray) -> None:
+        """Cut the first environment's observations, shape (n_steps, obs_dim), where its episodes ended."""
+        start = 0
+        for end, last_observation in self._ends:
+            self.routes.append(np.concatenate([*self._route, observations[start:end], last_observation[None]]))
+            self._route.clear()
+            start = end
+        self._route.append(observations[start:].copy())
+        self._ends.clear()
+
+    def _move_to(self, extent: Extent) -> None:
+        assert self._extent is not None
+        left, right, bottom, top = self._extent
+        middles = (np.arange(len(self.counts)) + 0.5) / len(self.counts)
+        across, up = np.meshgrid(left + middles * (right - left), bottom + middles * (top - bottom))
+        places = np.stack([across, up], axis=2).reshape(-1, 2)
+        self.counts = self._histogram(places, self.counts.reshape(-1), extent)
+
+    def _histogram(self, places: np.ndarray, numbers: np.ndarray, extent: Extent) -> np.ndarray:
+        """How many fall into each cell; those at places outside fall into none."""
         left, right, bottom, top = extent
         # As observations mostly are: the float32 next to a bound is not beyond it.
+        places = places.astype(np.float32)
         low, high = np.array([left, bottom], np.float32), np.array([right, top], np.float32)
+        inside = ((places >= low) & (places <= high)).all(axis=1)
         resolution = len(self.counts)
-        places = self._buffer[: self._n_buffered][..., list(self.dims)].reshape(-1, 2).astype(np.float32)
-        places = places[((places >= low) & (places <= high)).all(axis=1)]
         # The upper end belongs to the last cell.
-        columns, rows = np.minimum((places - low) / (high - low) * resolution, resolution - 1).astype(np.int64).T
-        self.counts += np.bincount(rows * resolution + columns, minlength=resolution**2).reshape(self.counts.shape)
-        self._n_buffered = self._route_start = 0
-
-    def _keep_route(self) -> None:
-        """Take what the buffer has of the episode under way."""
-        self._route.append(self._buffer[self._route_start : self._n_buffered, 0].copy())
-        self._route_start = self._n_buffered
+        cells = np.minimum((places[inside] - low) / (high - low) * resolution, resolution - 1).astype(np.int64)
+        counts = np.zeros((resolution, resolution), np.int64)
+        np.add.at(counts, (cells[:, 1], cells[:, 0]), numbers[inside])
+        return counts
 
 
 def last_observation(infos: Sequence[dict[str, Any]], observations: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from .paced import picture_formats, write
 
 METRICS = ("rollout/ep_rew_mean", "rollout/ep_len_mean", "train/td_error", "train/visited_points", "time/fps")
 #: What makes no two runs differ in what they learn.
-LEFT_OUT = {"self", "policy", "env", "policy_kwargs", "tensorboard_log", "verbose", "_init_setup_model"}
+LEFT_OUT = {"self", "policy", "env", "policy_kwargs", "tensorboard_log", "verbose", "device", "_init_setup_model"}
 #: Longer descriptions are cut off: they stand in a column of a table.
 LONGEST = 60
 
@@ -69,8 +69,8 @@ def describe(model: Any) -> dict[str, bool | str | float | None]:
     }
 
 
-def _short(value: Any) -> bool | str | float:
-    if isinstance(value, bool | int | float | str):
+def _short(value: Any) -> bool | str | float | None:
+    if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.number):
         return float(value)

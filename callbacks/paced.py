@@ -49,7 +49,8 @@ class PacedCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._acted_at = self.n_calls
         self._seconds = self.FIRST_SECONDS
-        self._rested_since = time.perf_counter()
+        self._spent = 0.0
+        self._start = time.perf_counter()
         self._look_at = self._next_look()
 
     # A step takes some 30 µs, and what SB3 does around _on_step is felt. So on_step itself does as little as it can.
@@ -57,10 +58,13 @@ class PacedCallback(BaseCallback):
     def on_step(self) -> bool:
         self.n_calls += 1
         if self.n_calls >= self._look_at:
-            self.num_timesteps = self.model.num_timesteps
-            self._on_step()
-            self._look_at = self._next_look()
+            self._look()
         return True
+
+    def _look(self) -> None:
+        self.num_timesteps = self.model.num_timesteps
+        self._on_step()
+        self._look_at = self._next_look()
 
     def update_locals(self, locals_: dict[str, Any]) -> None:
         self.locals = locals_
@@ -73,15 +77,15 @@ class PacedCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.freq is None:
-            due = (time.perf_counter() - self._rested_since) * self.SHARE >= self._seconds
+            due = (time.perf_counter() - self._start) * self.SHARE >= self._spent + self._seconds
         else:
             due = self.n_calls % self.freq == 0
         if due:
             start = time.perf_counter()
             self._acted_at = self.n_calls
             self._act()
-            self._rested_since = time.perf_counter()
-            self._seconds = self._rested_since - start
+            self._seconds = time.perf_counter() - start
+            self._spent += self._seconds
         return True
 
     def _next_look(self) -> int:

@@ -16,7 +16,7 @@ from sb3_knntd.kernels.step import UNDRAWN
 from .paced import PacedCallback
 
 #: Calls between two of which the transition is kept. A prime, lest it beat with the length of the episodes.
-STRIDE = 37
+STRIDE = 101
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}
 
 
@@ -40,7 +40,7 @@ class Transitions(NamedTuple):
 
 class PerceptionStatsCallback(PacedCallback):
     """
-    Logs how observations are seen and what learning does, from a sample of the transitions (one call in 37) and at
+    Logs how observations are seen and what learning does, from a sample of the transitions (one call in 102) and at
     training's end:
 
     ============================== ====================================================================================

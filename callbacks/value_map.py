@@ -108,11 +108,16 @@ class ValueMapCallback(PacedCallback):
         super()._on_training_start()
 
     def on_step(self) -> bool:
-        footprints, observations = self._footprints, self.locals["new_obs"]
-        if self.locals["dones"][0]:
-            footprints.end_route(last_observation(self.locals["infos"], observations))
-        footprints.add(observations)
-        return super().on_step()
+        local = self.locals
+        observations = local["new_obs"]
+        if local["dones"][0]:
+            self._footprints.end_route(last_observation(local["infos"], observations))
+        # Not copied: SB3's algorithms hold on to what a VecEnv returned as well.
+        self._footprints.recent.append(observations)
+        self.n_calls += 1
+        if self.n_calls >= self._look_at:
+            self._look()
+        return True
 
     def _on_step(self) -> bool:
         if self._footprints.room == 0:

@@ -8,7 +8,9 @@ headless Chromium, and take a picture of what it shows.
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -25,11 +27,12 @@ from sb3_knntd.callbacks import (
     ValueMapCallback,
 )
 from stable_baselines3.common.callbacks import BaseCallback
-from tensorboard import program
 
 from sb3_knntd import KNNTD, ExA
 from sb3_knntd.base import KNNAlgorithm
 
+#: Where TensorBoard says it can be reached.
+ADDRESS = re.compile(r"http://\S+:\d+/")
 CHROMIUM = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 CHROMIUM_ARGUMENTS = [
     "--headless",
@@ -56,7 +59,7 @@ SCALARS = [
 IMAGES = ["map/value", "video/episode"]
 FILTER = "^perception|td_error_q|trace|policy"
 #: TensorBoard's tabs, and width and height of the window that shows all there is.
-TABS = {"scalars": (1420, 1080), "images": (1420, 900), "hparams": (1420, 420)}
+TABS = {"scalars": (1420, 1080), "images": (1420, 820), "hparams": (1420, 420)}
 TIMEOUT = 60_000
 
 
@@ -106,15 +109,20 @@ def open_tensorboard(logs: Path) -> Iterator[tuple[str, Page]]:
     chromium = find_chromium()
     if chromium is None:
         raise FileNotFoundError(f"no Chromium: none of {', '.join(CHROMIUM)} is on the PATH")
-    board = program.TensorBoard()
-    board.configure(argv=[None, "--logdir", str(logs), "--host", "127.0.0.1", "--port", "0", "--load_fast", "false"])
-    url = board.launch()
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=CHROMIUM_ARGUMENTS)
-        page = browser.new_page()
-        page.set_default_timeout(TIMEOUT)
-        yield url, page
-        browser.close()
+    # From the folder above, as the page shows the path it was given.
+    command = [sys.executable, "-m", "tensorboard.main", "--logdir", logs.name, "--host", "127.0.0.1", "--port", "0"]
+    with subprocess.Popen(command, cwd=logs.parent, stderr=subprocess.PIPE, text=True) as board:
+        try:
+            assert board.stderr is not None
+            url = next(match[0] for match in map(ADDRESS.search, board.stderr) if match)
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path=chromium, args=CHROMIUM_ARGUMENTS)
+                page = browser.new_page()
+                page.set_default_timeout(TIMEOUT)
+                yield url, page
+                browser.close()
+        finally:
+            board.terminate()
 
 
 def show(page: Page, url: str, tab: str) -> None:

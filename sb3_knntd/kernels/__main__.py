@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, DeltaFilter
 
 
 def main() -> None:
-    """Learn and predict one step with each type of table and of observations."""
+    """Learn and predict one step with each type of table and of observations, and filter one."""
     for env_id, dtype in (
         ("MountainCar-v0", th.float64),
         ("MountainCar-v0", th.float32),
@@ -17,6 +18,9 @@ def main() -> None:
     ):
         model = KNNTD(env_id, policy_kwargs={"dtype": dtype}).learn(1)
         model.predict(np.asarray(model.observation_space.sample()), deterministic=True)
+    env = DeltaFilter(gym.make("MountainCar-v0"))
+    env.reset()
+    env.step(0)
 
 
 if __name__ == "__main__":

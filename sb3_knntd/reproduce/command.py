@@ -72,7 +72,8 @@ def reproduce(name: str, best: bool, seeds: range, episodes: int | None, out: Pa
     of_whom = "this project's best settings" if best else "the paper's settings"
     text = "\n".join(textwrap.wrap(figure.verdict(results), WIDTH)) + "\n"
     picture = io.BytesIO()
-    figure.draw(results, f"Figure {name[3:]} with {of_whom}, {seeds_range(seeds)}").savefig(picture, format="png")
+    title = f"Figure {name.removeprefix('fig')} with {of_whom}, {seeds_range(seeds)}"
+    figure.draw(results, title).savefig(picture, format="png")
     contents = {
         **{file: _csv(table) for file, table in figure.tables(results).items()},
         "figure.png": picture.getvalue(),

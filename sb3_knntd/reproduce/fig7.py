@@ -194,7 +194,7 @@ def _draw_route(axes: Axes, results: Results, dims: tuple[int, int], scale: floa
         )
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
-    axes.legend(frameon=False, fontsize="small")
+    axes.legend(framealpha=0.85, edgecolor="none", fontsize="small")
 
 
 def _draw_actions(axes: Axes, results: Results) -> None:

@@ -1,0 +1,109 @@
+"""Which configuration an algorithm gets for an environment."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import rl_zoo3
+import yaml
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+
+#: Algorithms of this project, in the order in which they are shown.
+OURS = ("knntd", "exa")
+#: Those whose configurations this package has.
+PACKAGED = (*OURS, "sarsa")
+#: Always there.
+FLOOR = "random"
+
+#: What algorithms are called in tables and pictures; others by their names in capitals.
+LABELS = {"knntd": "kNN-TD(λ)", "exa": "Ex⟨a⟩(λ)", "sarsa": "SARSA(λ), tiles", "random": "random", "qrdqn": "QR-DQN"}
+#: The only policy that they have.
+POLICIES = {"knntd": "KNNPolicy", "exa": "KNNPolicy", "sarsa": "TilePolicy", "random": "RandomPolicy"}
+#: The actions that they can take; all others of RL Zoo take both.
+ACTIONS: dict[str, type[spaces.Space[Any]]] = {
+    **dict.fromkeys(("knntd", "sarsa", "dqn", "qrdqn"), spaces.Discrete),
+    **dict.fromkeys(("exa", "sac", "td3", "tqc", "ddpg", "crossq"), spaces.Box),
+}
+#: Entries of a configuration that only say how long RL Zoo trains.
+DURATION = "n_timesteps"
+
+
+class Configuration(NamedTuple):
+    """
+    :param hyperparams: in RL Zoo's form, as JSON gives them back
+    :param source: where they are from, for the reader of the report
+    :param tuned_steps: for how many steps they were made, ``None`` if they do not say
+    """
+
+    hyperparams: dict[str, Any]
+    source: str
+    tuned_steps: int | None = None
+
+
+def label(algo: str) -> str:
+    """
+    :param algo: name of an algorithm
+    :return: what it is called in tables and pictures
+    """
+    return LABELS.get(algo, algo.upper())
+
+
+def fits(algo: str, env_id: str) -> bool:
+    """
+    :param algo: name of an algorithm
+    :param env_id: environment
+    :return: whether it can take the environment's actions
+    """
+    with gym.make(env_id) as env:
+        return isinstance(env.action_space, ACTIONS.get(algo, spaces.Space))
+
+
+def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Path]) -> Configuration:
+    """
+    :param algo: name of an algorithm
+    :param env_id: environment
+    :param defaults: whether it is to have its own defaults
+    :param conf: by algorithm, a file in RL Zoo's form that is to be taken instead
+    :return: the entry of the environment in that file, or in RL Zoo's or this package's own, else the entry
+        ``default`` there, else the algorithm's defaults
+    :raises ValueError: if a file that was named has neither entry, or is none in RL Zoo's form
+    :raises OSError: if it cannot be read
+    """
+    plain = Configuration({"policy": _policy(algo, env_id)}, "the algorithm's defaults")
+    if algo == FLOOR or (defaults and algo not in conf):
+        return plain
+    if algo in conf:
+        path, source = conf[algo], conf[algo].name
+    elif algo in PACKAGED:
+        path, source = Path(str(files("sb3_knntd.zoo_configs") / f"{algo}.yml")), f"{algo}.yml of this package"
+    else:
+        path, source = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml", f"{algo}.yml of RL Zoo"
+    entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path} must have an entry for each environment, as RL Zoo's files do")
+    for entry in (env_id, "default"):
+        if entry in entries:
+            found = json.loads(json.dumps(entries[entry]))
+            steps = found.pop(DURATION, None)
+            if set(found) <= {"policy"}:
+                return plain._replace(hyperparams=found or plain.hyperparams)
+            return Configuration(found, f"{source}, {entry}", steps if steps is None else int(steps))
+    if algo in conf:
+        raise ValueError(f"{path} has neither an entry {env_id!r} nor 'default'")
+    return plain
+
+
+def _policy(algo: str, env_id: str) -> str:
+    if algo in POLICIES:
+        return POLICIES[algo]
+    with gym.make(env_id) as env:
+        space = env.observation_space
+    if isinstance(space, spaces.Dict):
+        return "MultiInputPolicy"
+    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"

@@ -1,0 +1,121 @@
+"""
+Point estimates and 95 % intervals over seeds, by rliable's stratified bootstrap (Agarwal et al., NeurIPS 2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+from rliable import library, metrics
+from scipy.stats import trim_mean
+
+#: Resamples of a bootstrap.
+REPETITIONS = 2000
+#: With fewer seeds an interval says little of where the truth lies.
+FEWEST_SEEDS = 5
+
+#: What is told of the final scores, and whether more is better.
+AGGREGATES: dict[str, Callable[[np.ndarray], float]] = {
+    "IQM": metrics.aggregate_iqm,
+    "median": metrics.aggregate_median,
+    "optimality gap": metrics.aggregate_optimality_gap,
+}
+
+
+class Estimate(NamedTuple):
+    """
+    Point estimates with their intervals, arrays of one shape.
+
+    :param value: estimates
+    :param low: lower ends
+    :param high: upper ends
+    """
+
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+@contextmanager
+def fixed_seed() -> Iterator[None]:
+    """rliable resamples by NumPy's global generator: the same results get the same intervals."""
+    state = np.random.get_state()
+    np.random.seed(0)
+    try:
+        yield
+    finally:
+        np.random.set_state(state)
+
+
+def estimate(scores: Mapping[str, np.ndarray], function: Callable[[np.ndarray], np.ndarray]) -> dict[str, Estimate]:
+    """
+    :param scores: by algorithm, shape (n_runs, n_tasks, ...)
+    :param function: from scores of that shape to shape (n,)
+    :return: by algorithm, what the function says, shape (n,)
+    """
+    with fixed_seed():
+        values, intervals = library.get_interval_estimates(dict(scores), function, reps=REPETITIONS)
+    return {algo: Estimate(values[algo], *intervals[algo]) for algo in scores}
+
+
+def curves(scores: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+    """
+    :param scores: by algorithm, shape (n_runs, n_tasks, n_points)
+    :return: by algorithm, the interquartile mean at each point, shape (n_points,)
+    """
+    return estimate(scores, _iqm_by_point)
+
+
+def _iqm_by_point(scores: np.ndarray) -> np.ndarray:
+    # metrics.aggregate_iqm of each point, all in one go.
+    means: np.ndarray = trim_mean(scores.reshape(-1, scores.shape[-1]), 0.25, axis=0)
+    return means
+
+
+def aggregates(scores: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
+    """
+    :param scores: by algorithm, final ones, shape (n_runs, n_tasks)
+    :return: by algorithm, the values of :data:`AGGREGATES`, in their order
+    """
+    return estimate(scores, lambda drawn: np.array([function(drawn) for function in AGGREGATES.values()]))
+
+
+def profiles(scores: Mapping[str, np.ndarray], thresholds: np.ndarray) -> dict[str, Estimate]:
+    """
+    :param scores: by algorithm, final ones, shape (n_runs, n_tasks)
+    :param thresholds: shape (n,)
+    :return: by algorithm, the share of runs whose score is above each threshold, shape (n,)
+    """
+    with fixed_seed():
+        values, intervals = library.create_performance_profile(dict(scores), thresholds, reps=REPETITIONS)
+    return {algo: Estimate(values[algo], *intervals[algo]) for algo in scores}
+
+
+def improvements(scores: Mapping[str, np.ndarray], firsts: Sequence[str]) -> dict[tuple[str, str], Estimate]:
+    """
+    :param scores: by algorithm, final ones, shape (n_runs, n_tasks)
+    :param firsts: the algorithms to compare with all others
+    :return: by pair, the probability that a run of the first has a higher score than one of the second, ties counted
+        half, mean over environments, shape (1,)
+    """
+    pairs = {
+        (first, second): [scores[first], scores[second]] for first in firsts for second in scores if second != first
+    }
+    if not pairs:
+        return {}
+    with fixed_seed():
+        values, intervals = library.get_interval_estimates(
+            {f"{first},{second}": drawn for (first, second), drawn in pairs.items()},
+            lambda first, second: np.array([_probability_of_improvement(first, second)]),
+            reps=REPETITIONS,
+        )
+    return {pair: Estimate(values[",".join(pair)], *intervals[",".join(pair)]) for pair in pairs}
+
+
+def _probability_of_improvement(first: np.ndarray, second: np.ndarray) -> float:
+    # metrics.probability_of_improvement is this, by way of a rank test whose p-value is thrown away.
+    differences = first[:, None, :] - second[None, :, :]
+    return float(((differences > 0) + 0.5 * (differences == 0)).mean())
