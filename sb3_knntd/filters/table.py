@@ -234,7 +234,8 @@ class DeltaTable:
 
     def follow(self, estimates: np.ndarray) -> None:
         """
-        Widen adaptive bounds where estimates lie beyond them. Where points move, each is given what the table had there.
+        Widen adaptive bounds where estimates lie beyond them. Where points move, each is given what was
+        there.
 
         :param estimates: shape (n_envs, obs_dim)
         """

@@ -269,8 +269,8 @@ def learn(desk, observations, rewards, ended, rates):
     :param rewards: shape (n_envs,)
     :param ended: whether the episodes have, shape (n_envs,), bool
     :param rates: (α, λ, ε or temperature)
-    :return: ``FINE``; or ``USED_UP``, and then nothing has been done, or ``NOT_FINITE`` or ``DIVERGED``, and then no value
-        has been changed
+    :return: ``FINE``; or ``USED_UP``, and then nothing has been done; or ``NOT_FINITE`` or ``DIVERGED``, and then no
+        value has been changed
     """
     if desk.taken[0] == len(desk.uniforms):
         return USED_UP
