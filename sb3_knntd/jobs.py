@@ -139,7 +139,7 @@ def run_locally(
         while waiting or running:
             while waiting and idle:
                 (job, attempt), worker = waiting.popleft(), idle.pop()
-                with _environment(ONE_THREAD):  # a worker starts with its first job
+                with _environment(ONE_THREAD), _interrupts_held():  # a worker starts with its first job
                     running[worker.submit(compute, job)] = job, attempt, worker
                 yield job, None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -242,6 +242,19 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C comes afterwards; to a process that is started meanwhile never, not even before it can ask not to."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
