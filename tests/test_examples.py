@@ -58,6 +58,15 @@ def test_cliff_walking(tmp_path: Path) -> None:
     assert float(sarsa_return) > float(q_return)
 
 
+def test_noisy_sensors(tmp_path: Path) -> None:
+    printed = run("noisy_sensors.py", tmp_path)
+    without, filtered = (int(steps) for steps in re.findall(r"filter: (\d+) steps to the goal", printed))
+    assert filtered < without
+    position, velocity = re.search(r"(\S+) of position, (\S+) of velocity", printed).groups()
+    assert max(float(position), float(velocity)) < 0.75
+    assert (tmp_path / "noisy_sensors.png").read_bytes().startswith(PNG)
+
+
 @pytest.mark.parametrize("name", ["look_inside.ipynb"])
 def test_notebooks_run(name: str, tmp_path: Path) -> None:
     notebook = nbformat.read(EXAMPLES / name, as_version=4)
