@@ -40,4 +40,4 @@ linkcheck: $(VENV)/installed  ## Check the documentation's links to other sites
 	$(BIN)/python -m sphinx -b linkcheck docs docs/_build/linkcheck
 
 clean:  ## Remove what set-up and runs have made
-	rm -rf $(VENV) build dist demo docs/_build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist demo docs/_build docs/examples/*.ipynb *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -50,6 +50,9 @@ add_module_names = False
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 88
 
+# Publishers turn robots away.
+linkcheck_ignore = [r"https://doi\.org/.*"]
+
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
 
