@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_knntd.base import MEASURING_STEPS
+from sb3_knntd.perception.bounds import MEASURING_STEPS
 from sb3_knntd.checks import check_integer, check_number, check_schedule
 from sb3_knntd.compare.stepwise import StepwiseAlgorithm
 from sb3_knntd.compare.tile_coding import TileCoder
@@ -85,13 +85,13 @@ class Traces(NamedTuple):
         (n_actions * n_features,)
     :param features: the list, shape (n_actions * n_features,), filled from the beginning
     :param values: traces of those in the list
-    :param count: how many are in the list, shape (1,)
+    :param n_listed: how many are in the list, shape (1,)
     """
 
     slots: np.ndarray
     features: np.ndarray
     values: np.ndarray
-    count: np.ndarray
+    n_listed: np.ndarray
 
 
 class TileSarsa(StepwiseAlgorithm):
@@ -242,7 +242,7 @@ class TileSarsa(StepwiseAlgorithm):
             self.trace_decay,
         )
         if done:
-            forget(self._traces.slots, self._traces.features, self._traces.count)
+            forget(self._traces.slots, self._traces.features, self._traces.n_listed)
             self._q_old, self._last_features = 0.0, None
         else:
             self._last_features, self._last_action = features, action
@@ -268,7 +268,7 @@ def choose(weights: np.ndarray, features: np.ndarray, epsilon: float, first: flo
         for feature in features:
             values[action] += weights[action, feature]
     best = np.flatnonzero(values == values.max())
-    return best[int(second * len(best))]
+    return int(best[int(second * len(best))])
 
 
 @jit
@@ -277,7 +277,7 @@ def learn_step(
     slots: np.ndarray,
     listed: np.ndarray,
     values: np.ndarray,
-    count: np.ndarray,
+    n_listed: np.ndarray,
     features: np.ndarray,
     next_features: np.ndarray,
     reward: float,
@@ -294,7 +294,7 @@ def learn_step(
     :param slots: as in :class:`Traces`
     :param listed: as in :class:`Traces`, ``features`` there
     :param values: as in :class:`Traces`
-    :param count: as in :class:`Traces`
+    :param n_listed: as in :class:`Traces`
     :param features: x, active in the last state with the action taken, shape (n_tilings,)
     :param next_features: x', active in this state with the action chosen
     :param reward: R
@@ -317,7 +317,7 @@ def learn_step(
 
     decay = gamma * trace_decay
     kept = 0
-    for slot in range(count[0]):
+    for slot in range(n_listed[0]):
         feature, value = listed[slot], values[slot] * decay
         if abs(value) >= SMALLEST_TRACE:
             listed[kept], values[kept] = feature, value
@@ -331,7 +331,7 @@ def learn_step(
             kept += 1
             slots[feature] = kept
         values[slots[feature] - 1] += 1.0 - alpha * decay * trace
-    count[0] = kept
+    n_listed[0] = kept
 
     for slot in range(kept):
         weights[listed[slot]] += alpha * (error + q - q_old) * values[slot]
@@ -341,14 +341,14 @@ def learn_step(
 
 
 @jit
-def forget(slots: np.ndarray, listed: np.ndarray, count: np.ndarray) -> None:
+def forget(slots: np.ndarray, listed: np.ndarray, n_listed: np.ndarray) -> None:
     """
     Set all traces to 0; arguments as in :func:`learn_step`.
 
     :param slots: by feature, its place in the list
     :param listed: the features in the list
-    :param count: how many
+    :param n_listed: how many
     """
-    for slot in range(count[0]):
+    for slot in range(n_listed[0]):
         slots[listed[slot]] = 0
-    count[0] = 0
+    n_listed[0] = 0
