@@ -1,0 +1,128 @@
+"""
+The 2008 competition's generalised Mountain-Car: one configuration, that of ``zoo_configs/knntd.yml``, on many problems,
+whose offsets, noise and dynamics nobody tells the learner.
+
+    python -m benchmarks.competition [--problems 30] [--first-problem 0] [--workers N] [--json FILE]
+
+Each problem is learned for 100 episodes of at most 1000 steps, all of them counted, once for each way of seeing it:
+through the δs filter and adaptive bounds, with one of them, and with neither. A table shows the steps of an episode,
+the median over problems, and the share of problems whose last ten episodes take 150 steps or fewer in the mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from concurrent.futures import ProcessPoolExecutor
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+import sb3_knntd.envs  # noqa: F401
+from benchmarks.machine import describe
+from sb3_knntd import KNNTD, VecDeltaFilter
+
+ENV_ID = "sb3_knntd/GeneralizedMountainCar-v0"
+EPISODES, MOST_STEPS = 100, 1000
+#: What an episode may take in the end, and over how many that is asked.
+WANTED_STEPS, LAST_EPISODES = 150, 10
+
+
+class Sight(NamedTuple):
+    """
+    How the problems are seen.
+
+    :param what: its name
+    :param filtered: whether through the δs filter
+    :param bounds: of learner and filter
+    """
+
+    what: str
+    filtered: bool
+    bounds: str | None
+
+
+SIGHTS = (
+    Sight("filter, adaptive bounds", True, "adaptive"),
+    Sight("adaptive bounds", False, "adaptive"),
+    Sight("filter", True, None),
+    Sight("neither", False, None),
+)
+
+
+class CountEpisodes(BaseCallback):
+    """
+    Notes how long episodes are, and ends the training after so many.
+
+    :param n_episodes: how many
+    """
+
+    def __init__(self, n_episodes: int) -> None:
+        super().__init__()
+        self.n_episodes = n_episodes
+        self.lengths: list[int] = []
+
+    def _on_step(self) -> bool:
+        self.lengths += [info["episode"]["l"] for info in self.locals["infos"] if "episode" in info]
+        return len(self.lengths) < self.n_episodes
+
+
+def settings() -> dict[str, Any]:
+    """
+    :return: arguments of the learner in ``zoo_configs/knntd.yml``
+    """
+    stored = yaml.safe_load(files("sb3_knntd.zoo_configs").joinpath("knntd.yml").read_text())[ENV_ID]
+    return {name: value for name, value in stored.items() if name not in ("n_timesteps", "policy", "vec_env_wrapper")}
+
+
+def learn(sight: Sight, problem: int) -> list[int]:
+    """
+    :param sight: how it is seen
+    :param problem: number of the problem
+    :return: steps of each episode
+    """
+    th.set_num_threads(1)
+    venv: VecEnv = DummyVecEnv([lambda: Monitor(gym.make(ENV_ID, problem=problem, max_episode_steps=MOST_STEPS))])
+    if sight.filtered:
+        venv = VecDeltaFilter(venv, bounds=sight.bounds)
+    model = KNNTD(venv, **{**settings(), "bounds": sight.bounds}, seed=problem)
+    count = CountEpisodes(EPISODES)
+    model.learn(EPISODES * MOST_STEPS, callback=count)
+    return count.lengths
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--problems", type=int, default=30, help="number of problems")
+    parser.add_argument("--first-problem", type=int, default=0, help="the configuration was tuned on 200 to 207")
+    parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
+    parser.add_argument("--json", metavar="FILE", help="also store the steps of all episodes")
+    arguments = parser.parse_args()
+    problems = range(arguments.first_problem, arguments.first_problem + arguments.problems)
+    blocks = [(0, 10), (10, 20), (20, 50), (50, 90), (90, 100)]
+    names = " | ".join(f"episodes {first + 1} to {end}" for first, end in blocks)
+    print(f"| seen through | {names} | in the end at most {WANTED_STEPS} |")
+    print("|" + "---|" * (len(blocks) + 2))
+    stored = {}
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        for sight in SIGHTS:
+            lengths = np.array(list(pool.map(learn, [sight] * len(problems), problems)))
+            medians = " | ".join(f"{np.median(lengths[:, first:end].mean(axis=1)):.0f}" for first, end in blocks)
+            share = (lengths[:, -LAST_EPISODES:].mean(axis=1) <= WANTED_STEPS).mean()
+            print(f"| {sight.what} | {medians} | {share:.0%} of problems |", flush=True)
+            stored[sight.what] = lengths.tolist()
+    print(f"\nProblems {problems[0]} to {problems[-1]}.", ", ".join(f"{key} {value}" for key, value in describe().items()))
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump({"machine": describe(), "problems": list(problems), "lengths": stored}, file)
+
+
+if __name__ == "__main__":
+    main()
