@@ -37,7 +37,7 @@ def save_table(path: str | pathlib.Path, table: DeltaTable, training: bool) -> N
         "training": training,
     }
     with replacing(target) as file:
-        save_to_zip_file(file, data, {"filter": table.state_dict()})  # type: ignore[arg-type]
+        save_to_zip_file(file, data, {"filter": table.state_dict()})
 
 
 def load_table(
