@@ -43,7 +43,7 @@ def main() -> None:
             exploration_final_eps=0.1,
             seed=0,
         )
-        model.learn(40_000)
+        model.learn(30_000)
         returns = [episode["r"] for episode in model.ep_info_buffer]
         route = greedy_route(model, model.get_env())
 

@@ -8,6 +8,7 @@ import importlib
 import re
 import runpy
 import shlex
+import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -150,6 +151,23 @@ def test_reference_has_every_public_name(module: str) -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
     described = set(re.findall(r"\.\. autoclass:: (?:[\w.]+\.)?(\w+)$", text, re.MULTILINE))
     assert set(importlib.import_module(module).__all__) <= described
+
+
+def test_reference_has_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    names = re.findall(r"^    (\w+) ", capsys.readouterr().out, re.MULTILINE)
+    assert "demo" in names
+    text = (ROOT / "docs" / "reference" / "command_line.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in text for name in names)
+
+
+@pytest.mark.slow
+def test_pictures_of_the_algorithms_are_drawn(tmp_path: Path) -> None:
+    script = ROOT / "docs" / "pictures.py"
+    subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
+    shown = re.findall(r"\(images/(\w+\.png)\)", (ROOT / "docs" / "algorithm.md").read_text(encoding="utf-8"))
+    assert {path.name for path in tmp_path.iterdir()} == set(shown)
 
 
 def test_citation_tells_of_this_version_and_of_the_paper() -> None:

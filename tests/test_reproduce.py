@@ -20,9 +20,11 @@ import numpy as np
 import pytest
 
 import sb3_knntd.cli
+from sb3_knntd import DeltaFilter
 from sb3_knntd.cli import main
 from sb3_knntd.reproduce import FIGURES
 from sb3_knntd.reproduce.curves import episode_lengths
+from sb3_knntd.reproduce.fig4 import SignalRecorder, constant_error
 from sb3_knntd.reproduce.fig6 import success
 from sb3_knntd.reproduce.fig7 import FullEpisodeRecorder, mean_change, used_share
 from sb3_knntd.reproduce.settings import ALGORITHMS, load_settings, make_model, total_steps
@@ -89,6 +91,100 @@ def test_figure_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert f"median {np.median(then):g} [" in verdict
     assert f"{(then <= 105).sum()} of 2 seeds take 105 or fewer" in verdict
     assert verdict.endswith(f"Median at most 105: {'yes' if np.median(then) <= 105 else 'no'}.")
+
+
+def late_ratios(table: list[dict[str, str]], dimension: str) -> list[float]:
+    """Of each seed the error of the filtered over that of the raw signal, in the last 20 episodes taken together."""
+    found = []
+    for seed in dict.fromkeys(row["seed"] for row in table):
+        late = [row for row in table if row["seed"] == seed and row["dimension"] == dimension][-20:]
+        squares = {
+            name: sum((int(row["steps"]) + 1) * float(row[name]) ** 2 for row in late) for name in ("raw", "filtered")
+        }
+        found.append(math.sqrt(squares["filtered"] / squares["raw"]))
+    return found
+
+
+def test_figure_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = run(["fig4", "--best", "--episodes", "22"], tmp_path)
+    check_files(folder, capsys.readouterr().out, ["table.csv", "episodes.csv", "figure.png", "verdict.txt"])
+    table = rows(folder / "table.csv")
+    places = [(int(row["seed"]), int(row["episode"]), row["dimension"]) for row in table]
+    assert places == [
+        (seed, episode, dimension)
+        for seed in (1000, 1001)
+        for episode in range(1, 23)
+        for dimension in ("position", "velocity")
+    ]
+    # Beta(5, 2) deviates by 0.16, and the problem's noise divider is between 5 and 20; of short episodes a bit more.
+    for dimension, width in (("position", 1.8), ("velocity", 0.14)):
+        raw = [float(row["raw"]) / (0.16 * width) for row in table if row["dimension"] == dimension]
+        assert 1 / 20 / 1.4 < min(raw) <= max(raw) < 1 / 5 * 1.4
+
+    episodes = rows(folder / "episodes.csv")
+    assert {row["seed"] for row in episodes} == {"1000"}, "the first, not a chosen one"
+    for episode in (1, 22):
+        shown = [row for row in episodes if int(row["episode"]) == episode]
+        assert [int(row["step"]) for row in shown] == list(range(len(shown)))
+        for dimension in ("position", "velocity"):
+            (row,) = (row for row in table[:44] if int(row["episode"]) == episode and row["dimension"] == dimension)
+            assert int(row["steps"]) == len(shown) - 1
+            signals = {
+                name: np.array([float(each[f"{name}_{dimension}"]) for each in shown])
+                for name in ("true", "raw", "filtered")
+            }
+            assert signals["raw"][0] == signals["filtered"][0]
+            for name in ("raw", "filtered"):
+                error = np.sqrt(np.mean((signals[name] - signals["true"]) ** 2))
+                assert float(row[name]) == pytest.approx(error)
+
+    verdict = verdict_of(folder)
+    assert "over 2 seeds (1000 to 1001)" in verdict
+    for dimension in ("position", "velocity"):
+        first = [
+            float(row["filtered"]) / float(row["raw"])
+            for row in table
+            if row["dimension"] == dimension and row["episode"] == "1"
+        ]
+        late = late_ratios(table, dimension)
+        middle = np.median(late)
+        assert (
+            f"{dimension.capitalize()}: median {interval(first)} in the first episode, {interval(late)} in the last 20 "
+            f"of 22. Noise is taken out (median below 1; so in {sum(left < 1 for left in late)} of 2 seeds): "
+            f"{'yes' if middle < 1 else 'no'}; half of it or more: {'yes' if middle <= 0.5 else 'no'}."
+        ) in verdict
+
+
+@pytest.mark.parametrize("parts", [{}, {"offset": False}, {"noise": False}, {"noise": False, "offset": False}])
+def test_what_is_the_same_in_all_observations_counts_as_no_error(parts: dict[str, bool]) -> None:
+    env = gym.make("sb3_knntd/GeneralizedMountainCar-v0", problem=3, **parts)
+    errors = []
+    for seed in range(400):
+        observation, info = env.reset(seed=seed)
+        errors.append(observation - info["state"])
+    constant = constant_error(env.unwrapped)
+    uncertainty = 4 * np.std(errors, axis=0) / 20 + 1e-6
+    assert (np.abs(np.mean(errors, axis=0) - constant) < uncertainty).all()
+    assert (constant != 0).all() == (len(parts) < 2)
+
+
+def test_signals_are_recorded_by_episode() -> None:
+    env = gym.make("sb3_knntd/GeneralizedMountainCar-v0", problem=3, max_episode_steps=5)
+    recorder = SignalRecorder(DeltaFilter(env, warmup=1e9))
+    constant, seen = constant_error(env.unwrapped), []
+    for seed in (0, 1):
+        seen.append([recorder.reset(seed=seed)])
+        for _ in range(5):
+            observation, *_, info = recorder.step(2)
+            seen[-1].append((observation, info))
+    assert [len(episode) for episode in recorder.episodes] == [6, 6]
+    for episode, signals in zip(seen, recorder.episodes, strict=True):
+        for (observation, info), (true, raw, filtered) in zip(episode, signals, strict=True):
+            np.testing.assert_array_equal(true, info["state"])
+            np.testing.assert_allclose(raw + constant, info["raw_observation"])
+            # A filter that trusts nothing passes what it is given.
+            np.testing.assert_allclose(filtered + constant, observation)
+            np.testing.assert_array_equal(filtered, raw)
 
 
 def test_figure_6(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,6 +269,15 @@ def test_settings_are_those_of_the_paper() -> None:
         setting = load_settings("fig6")["paper"][algorithm]
         assert (setting["n_neighbors"], setting["trace_decay"], setting["learning_rate"]) == (4, trace_decay, 0.3)
         assert load_settings("fig7")["paper"][algorithm]["n_neighbors"] == 8
+    fig4, fig3 = load_settings("fig4"), load_settings("fig3")["paper"]["knntd"]
+    algorithm_5 = fig4["paper"]["knntd"]["filter"]
+    assert (algorithm_5["gain"], algorithm_5["warmup"]) == (None, 0)
+    assert (algorithm_5["points"], algorithm_5["n_neighbors"]) == ([20, 15], 4)
+    # The learner is figure 3's, and both variants differ in the filter alone: one is that of its defaults.
+    same = fig3.keys() - {"env", "env_kwargs"}
+    assert {name: fig4["paper"]["knntd"][name] for name in same} == {name: fig3[name] for name in same}
+    assert {**fig4["best"]["knntd"], "filter": algorithm_5} == fig4["paper"]["knntd"]
+    assert fig4["best"]["knntd"]["filter"].keys() == {"bounds"}
     model = make_model("exa", load_settings("fig7")["paper"]["exa"], 0, lambda env: env)
     np.testing.assert_allclose(model.policy.action_points[0], np.linspace(-1, 1, 11))
     # The best is to be had with as many points and neighbours.
@@ -242,6 +347,7 @@ def test_only_an_episode_that_the_time_limit_ends_is_recorded() -> None:
         (["fig9"], "fig9"),
         (["fig7", "--best"], "leave out --best"),
         (["fig3", "--episodes", "43"], "at least 44"),
+        (["fig4", "--episodes", "20"], "at least 21"),
         (["fig6", "--episodes", "30"], "at least 31"),
         (["fig3", "--seeds", "0"], "--seeds"),
         (["fig3", "--first-seed", "2147483647"], "2147483647"),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Of each picture, inches. They are shown as wide as a telephone, or two beside each other.
-SIZE = 5.4, 3.7
+SIZE = 4.9, 3.5
 FLOOR_COLOR = "0.55"
 #: Okabe and Ito's colours, which the colour-blind can tell apart.
 COLORS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#4d4d00")
@@ -43,10 +43,18 @@ def _new_axes(height: float = SIZE[1]) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _draw_line(axes: Axes, x: np.ndarray, line: Estimate, algo: str, color: str) -> None:
+def _draw_line(axes: Axes, x: np.ndarray, line: Estimate, algo: str, color: str, steps: bool = False) -> None:
     above = algo in OURS
-    axes.fill_between(x, line.low, line.high, color=color, alpha=0.18, linewidth=0)
-    axes.plot(x, line.value, color=color, linewidth=2.4 if above else 1.6, zorder=4 if above else 3, label=label(algo))
+    axes.fill_between(x, line.low, line.high, color=color, alpha=0.18, linewidth=0, step="post" if steps else None)
+    axes.plot(
+        x,
+        line.value,
+        color=color,
+        linewidth=2.4 if above else 1.6,
+        zorder=4 if above else 3,
+        label=label(algo),
+        drawstyle="steps-post" if steps else "default",
+    )
 
 
 def _add_legend(figure: Figure, axes: Axes) -> None:
@@ -105,7 +113,7 @@ def draw_profiles(thresholds: np.ndarray, lines: Mapping[str, Estimate], palette
     """
     figure, axes = _new_axes()
     for algo, line in lines.items():
-        _draw_line(axes, thresholds, line, algo, palette[algo])
+        _draw_line(axes, thresholds, line, algo, palette[algo], steps=True)
     axes.set(xlabel="final score τ", ylabel="share of runs above τ", ylim=(-0.02, 1.02))
     axes.set_xlim(thresholds[0], thresholds[-1])
     _add_legend(figure, axes)

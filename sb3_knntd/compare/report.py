@@ -181,7 +181,7 @@ def group_statistics(group: Group) -> GroupStatistics:
     final = {algo: drawn[..., -1] for algo, drawn in scores.items()}
     lowest = min(0.0, min(float(drawn.min()) for drawn in final.values()))
     highest = max(1.0, max(float(drawn.max()) for drawn in final.values()))
-    thresholds = np.linspace(max(lowest, -1.0), highest * 1.02, 61)
+    thresholds = np.linspace(max(lowest, -1.0), highest * 1.02, 121)
     firsts = [algo for algo in final if algo in OURS] or list(final)[:1]
     n_points = next(iter(scores.values())).shape[-1]
     return GroupStatistics(
@@ -244,7 +244,7 @@ def make_report(comparison: Comparison) -> dict[str, bytes]:
         title=f"Comparison on {', '.join(task.env for task in comparison.tasks)}",
         summary=_summary(comparison, every),
         command=comparison.command,
-        notes=[*_warnings(comparison, results), *comparison.notes],
+        notes=[*cautions(comparison), *comparison.notes],
         failures=[{"name": name, "error": error} for name, error in comparison.failures.items()],
         tasks=task_views,
         groups=group_views,
@@ -394,7 +394,12 @@ def _summary(comparison: Comparison, algos: Sequence[str]) -> str:
     )
 
 
-def _warnings(comparison: Comparison, results: Sequence[Mapping[str, Any]]) -> list[str]:
+def cautions(comparison: Comparison) -> list[str]:
+    """
+    :param comparison: what is reported on
+    :return: what of it is to be read with care, a sentence or two each
+    """
+    every = [run for task in comparison.tasks for runs in task.runs.values() for run in runs]
     found = []
     fewest = min(len(runs) for task in comparison.tasks for runs in task.runs.values())
     if fewest < FEWEST_SEEDS:
@@ -402,9 +407,9 @@ def _warnings(comparison: Comparison, results: Sequence[Mapping[str, Any]]) -> l
             f"Fewer than {FEWEST_SEEDS} seeds: the intervals mean little. They are drawn from so few values that they "
             "are too narrow more often than not."
         )
-    if len(_distinct(json.dumps(result["versions"]) for result in results)) > 1:
+    if len(_distinct(json.dumps(run.result["versions"]) for run in every)) > 1:
         found.append("These results were made by different versions of the software.")
-    if len(_distinct(json.dumps(result["machine"]) for result in results)) > 1:
+    if len(_distinct(json.dumps(run.result["machine"]) for run in every)) > 1:
         found.append("These results were made on different machines: times do not compare.")
     busy = [
         share

@@ -20,7 +20,7 @@ ALGORITHMS: dict[str, type[KNNTD] | type[ExA]] = {"knntd": KNNTD, "exa": ExA}
 NAMES = {"knntd": "kNN-TD(λ)", "exa": "Ex⟨a⟩(λ)"}
 
 #: What a setting holds besides arguments of its algorithm.
-OF_THE_EXPERIMENT = ("env", "env_kwargs", "episodes")
+OF_THE_EXPERIMENT = ("env", "env_kwargs", "episodes", "filter")
 
 Setting = Mapping[str, Any]
 
