@@ -10,7 +10,6 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.checks import check_integer
-from sb3_knntd.compiled_learner import CompiledLearner
 from sb3_knntd.kernels.step import UNDRAWN
 
 from .paced import PacedCallback
@@ -25,7 +24,7 @@ class Transitions(NamedTuple):
     What happened in a step; ``n`` is n_envs, or the number of those of several steps.
 
     :param observations: shape (n, *obs_shape)
-    :param actions: as the action rule has them, shape (n,) or (n, action_dim)
+    :param actions: as the environment took them, shape (n, *action_shape)
     :param rewards: shape (n,)
     :param next_observations: the true ones, also where an episode ended, shape (n, *obs_shape)
     :param terminated: whether nothing can follow, shape (n,), bool
@@ -117,7 +116,7 @@ class PerceptionStatsCallback(PacedCallback):
             record(f"train/td_error_{name}", float(np.quantile(errors, quantile)))
         decay = model.gamma * float(model.trace_schedule(model._current_progress_remaining))
         record("train/trace_length", 1.0 / (1.0 - decay) if decay < 1.0 else float("inf"))
-        record("train/trace_points", _count_trace_points(model.learner))
+        record("train/trace_points", model.learner.n_traced)
         if self._earlier is not None:
             observations, greedy = self._earlier
             changed = model.policy.predict(observations)[0] != greedy
@@ -139,7 +138,8 @@ class PerceptionStatsCallback(PacedCallback):
         with th.no_grad():
             rows, probabilities = policy.perceived_rows(sample.observations)
             if isinstance(model.action_space, spaces.Discrete):
-                entries = th.from_numpy(sample.actions).to(rows.device)[:, None, None].expand(*rows.shape[:2], 1)
+                columns = th.from_numpy(sample.actions - model.action_space.start).to(rows.device)
+                entries = columns[:, None, None].expand(*rows.shape[:2], 1)
             else:
                 # What ExA's states are worth hangs on no entry (eq. 25).
                 entries = th.empty(0, dtype=th.int64, device=rows.device)
@@ -161,9 +161,3 @@ def _transitions(before: np.ndarray, local: dict[str, Any]) -> Transitions:
         after[index] = info.get("terminal_observation", after[index])
         dones[index] = not info.get("TimeLimit.truncated", False)
     return Transitions(before, np.copy(local["actions"]), np.copy(local["rewards"]), after, dones)
-
-
-def _count_trace_points(learner: Any) -> int:
-    if isinstance(learner, CompiledLearner):
-        return learner.live.count
-    return len(learner.state_dict()["traces"]["points"])

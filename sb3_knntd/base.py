@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import io
-import json
-import os
 import pathlib
-import secrets
 import sys
 import time
-import zipfile
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, TypeVar
@@ -25,18 +21,16 @@ from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, safe_m
 
 from sb3_knntd.checks import check_number, check_schedule, check_word
 from sb3_knntd.compiled_learner import CompiledLearner
+from sb3_knntd.files import read_description, replacing
 from sb3_knntd.kernels.step import UNDRAWN
 from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, check_finite, check_transition
 from sb3_knntd.memory import DenseTable
+from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
-
-#: Observations from a random policy that the range of an open dimension is taken from: in all, and of each env.
-MEASURING_STEPS = 1000
-MEASURING_STEPS_PER_ENV = 100
 
 NO_ENDINGS: tuple[list[int], np.ndarray] = [], np.empty(0)
 
@@ -443,8 +437,7 @@ class KNNAlgorithm(BaseAlgorithm):
     # -------------------------------------------- the range of open dimensions
 
     def _must_measure(self) -> bool:
-        wanted = max(MEASURING_STEPS, MEASURING_STEPS_PER_ENV * self.n_envs)
-        return self._n_measured < wanted and self.policy.perceiver.bounds.is_open
+        return self._n_measured < steps_to_measure(self.n_envs) and self.policy.perceiver.bounds.is_open
 
     def _random_actions(self) -> np.ndarray:
         n_actions = self.policy.table.n_actions
@@ -529,16 +522,8 @@ class KNNAlgorithm(BaseAlgorithm):
         if not target.suffix:
             target = target.with_name(f"{target.name}.zip")
         target.parent.mkdir(parents=True, exist_ok=True)
-        beside = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
-        try:
-            with open(beside, "xb") as file:
-                super().save(file, exclude, include)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(beside, target)
-        except BaseException:
-            beside.unlink(missing_ok=True)
-            raise
+        with replacing(target) as file:
+            super().save(file, exclude, include)
 
     @classmethod
     def load(
@@ -565,7 +550,7 @@ class KNNAlgorithm(BaseAlgorithm):
         :return: the model
         :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has
         """
-        saved = _read_data(path)
+        saved = read_description(path)
         if saved.get("algorithm") != cls.__name__:
             raise ValueError(
                 f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls.__name__}: "
@@ -590,29 +575,3 @@ def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
     :return: the share that remains, from 1 to 0
     """
     return 1.0 - num_timesteps / total_timesteps if num_timesteps < total_timesteps else 0.0
-
-
-def _read_data(path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
-    """What a saved file says of its model, read without unpickling anything; the file is checked to be whole."""
-    file: Any = path
-    if isinstance(path, (str, pathlib.Path)):
-        candidates = [pathlib.Path(path), pathlib.Path(f"{path}.zip")]
-        file = next((candidate for candidate in candidates if candidate.is_file()), None)
-        if file is None:
-            raise FileNotFoundError(f"no such file: {candidates[0]} (nor {candidates[1]})")
-    try:
-        with zipfile.ZipFile(file) as archive:
-            damaged = archive.testzip()
-            if damaged is not None:
-                raise ValueError(f"{path} is damaged: {damaged} in it is not what was written")
-            data = json.loads(archive.read("data"))
-            if not isinstance(data, dict):
-                raise ValueError(f"{path} is no saved model: what it says of its parameters is {data!r}")
-            if data.get("algorithm"):
-                archive.getinfo("policy.pth"), archive.getinfo("learner.pth")
-    except (zipfile.BadZipFile, KeyError, json.JSONDecodeError, EOFError) as error:
-        raise ValueError(f"{path} is no saved model, or was cut off: {error}") from error
-    finally:
-        if not isinstance(path, (str, pathlib.Path)):
-            path.seek(0)
-    return data

@@ -129,6 +129,10 @@ class CompiledLearner(Learner):
         self._n_sums += self.n_envs
         return self._actions
 
+    @property
+    def n_traced(self) -> int:
+        return self.live.count
+
     def summary(self) -> dict[str, float]:
         if not self._n_sums:
             return {}

@@ -83,6 +83,11 @@ class Learner(ABC):
         :raises FloatingPointError: if the values have diverged; nothing has been changed then
         """
 
+    @property
+    @abstractmethod
+    def n_traced(self) -> int:
+        """Number of points that have a trace."""
+
     @abstractmethod
     def summary(self) -> dict[str, float]:
         """
@@ -227,6 +232,10 @@ class TorchLearner(Learner):
         self._sums += th.stack((errors.abs().sum(), value.sum()))
         self._n_sums += self.n_envs
         return self._settle_in(perception, choice)
+
+    @property
+    def n_traced(self) -> int:
+        return len(self.traces.state()["points"])
 
     def summary(self) -> dict[str, float]:
         if not self._n_sums:

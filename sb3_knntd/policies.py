@@ -14,12 +14,13 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_knntd.actions import ActionColumns, make_action_columns
-from sb3_knntd.checks import check_integer, check_number, check_word
+from sb3_knntd.checks import check_number, check_word
 from sb3_knntd.exploration import greedy
 from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.step import best_entries
 from sb3_knntd.memory import DenseTable, HashedTable, QTable
 from sb3_knntd.perception import Lattice, Perceiver, Perception, Points, make_bounds, make_points, make_weights
+from sb3_knntd.perception.points import count_neighbors
 from sb3_knntd.perception.search import SEARCHES, make_search
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.rules import mean_actions, mean_rows
@@ -339,7 +340,8 @@ class ExAPolicy(KNNPolicy):
             actions = np.rint(actions)
         fitting: np.ndarray = actions.reshape(-1, *space.shape).astype(space.dtype)
         np.maximum(fitting, space.low, out=fitting)
-        return np.minimum(fitting, space.high, out=fitting)
+        np.minimum(fitting, space.high, out=fitting)
+        return fitting
 
     def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         return self.fit_actions((probabilities[..., None] * self.columns.points[entries].sum(axis=2)).sum(axis=1))
@@ -352,31 +354,3 @@ class ExAPolicy(KNNPolicy):
         points = th.from_numpy(self.columns.points).to(probabilities)
         actions = mean_actions(th.stack(entries, dim=2), probabilities, points)
         return th.from_numpy(self.fit_actions(actions.cpu().numpy()))
-
-
-def count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
-    """
-    :param n_neighbors: k, or ``"auto"``, see :class:`KNNPolicy`
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
-    :param n_points: number of points to choose from
-    :param obs_dim: number of observation dimensions
-    :return: k
-    :raises ValueError: if it is no integer >= 1, or there are not so many points
-    """
-    exact = not isinstance(observation_space, spaces.Box)
-    if isinstance(n_neighbors, str):
-        if n_neighbors != "auto":
-            raise ValueError(f"n_neighbors must be an integer >= 1, or 'auto'; got {n_neighbors!r}")
-        return 1 if exact else min(2 * obs_dim + 1, n_points)
-    k = check_integer("n_neighbors", n_neighbors, 1)
-    if exact and k != 1:
-        raise ValueError(
-            f"n_neighbors must be 1 or 'auto' for a {type(observation_space).__name__} observation space, whose "
-            f"states have no neighbours; got {k}"
-        )
-    if k > n_points:
-        raise ValueError(
-            f"n_neighbors must be at most the number of points, {n_points}; got {k}. "
-            "Give fewer neighbours or more points"
-        )
-    return k

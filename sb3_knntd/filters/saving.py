@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import pathlib
 from typing import Any
 
 from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 
-from sb3_knntd.base import _read_data
-from sb3_knntd.files import replace_file
+from sb3_knntd.files import read_description, replacing
 from sb3_knntd.filters.table import Arguments, DeltaTable
 
 #: What a file says that it holds.
@@ -38,9 +36,8 @@ def save_table(path: str | pathlib.Path, table: DeltaTable, training: bool) -> N
         "bounds_from_space": table.bounds_from_space,
         "training": training,
     }
-    file = io.BytesIO()
-    save_to_zip_file(file, data, {"filter": table.state_dict()})
-    replace_file(target, file.getvalue())
+    with replacing(target) as file:
+        save_to_zip_file(file, data, {"filter": table.state_dict()})
 
 
 def load_table(
@@ -53,7 +50,7 @@ def load_table(
     :return: what was learned, and whether it was learning
     :raises ValueError: if the file is damaged, holds something else, or is of other spaces
     """
-    if _read_data(path).get("content") != CONTENT:
+    if read_description(path).get("content") != CONTENT:
         raise ValueError(f"{path} holds no filter. Models are loaded by their own class, e.g. KNNTD.load")
     data, params, _ = load_from_zip_file(path, device="cpu")
     assert data is not None

@@ -10,13 +10,13 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.actions import make_action_columns
-from sb3_knntd.base import MEASURING_STEPS, MEASURING_STEPS_PER_ENV, progress_remaining
+from sb3_knntd.base import progress_remaining
 from sb3_knntd.checks import check_integer, check_number, check_schedule, check_word
 from sb3_knntd.kernels.filter import ADAPTIVE, COUNT, FIXED, OF_UPDATE
 from sb3_knntd.perception import Perceiver, make_bounds, make_points, make_weights
-from sb3_knntd.perception.points import AUTO_POINTS_PER_DIMENSION
+from sb3_knntd.perception.bounds import steps_to_measure
+from sb3_knntd.perception.points import AUTO_POINTS_PER_DIMENSION, count_neighbors
 from sb3_knntd.perception.search import make_search
-from sb3_knntd.policies import count_neighbors
 
 #: ``points="auto"``: a lattice of about this many points, fewer than a learner's: each entry has to average noise.
 AUTO_POINTS = 2000
@@ -222,8 +222,7 @@ class DeltaTable:
         :param n_envs: number of environments
         :return: whether the range of some dimension is still to be found
         """
-        wanted = max(MEASURING_STEPS, MEASURING_STEPS_PER_ENV * n_envs)
-        return self._is_open and self.n_measured < wanted
+        return self._is_open and self.n_measured < steps_to_measure(n_envs)
 
     def measure(self, observations: np.ndarray) -> None:
         """

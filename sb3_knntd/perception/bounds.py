@@ -17,6 +17,19 @@ MARGIN = 0.25
 FARTHEST = 1e4
 
 
+#: Observations that the range of an open dimension is taken from: in all, and of each environment.
+MEASURING_STEPS = 1000
+MEASURING_STEPS_PER_ENV = 100
+
+
+def steps_to_measure(n_envs: int) -> int:
+    """
+    :param n_envs: number of environments
+    :return: how many observations the range of an open dimension is taken from
+    """
+    return max(MEASURING_STEPS, MEASURING_STEPS_PER_ENV * n_envs)
+
+
 class Bounds(nn.Module):
     """
     Affine map of each observation dimension onto [-1, 1] (eq. 4 of the paper). Values outside are kept, up to 10,000.

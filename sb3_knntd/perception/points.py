@@ -129,3 +129,31 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
     if not np.issubdtype(array.dtype, np.number) or not np.all(np.isfinite(array)):
         raise ValueError("points: scattered points must be finite numbers; got NaN, infinity or something else")
     return Scattered(array)
+
+
+def count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
+    """
+    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for finite states
+    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param n_points: number of points to choose from
+    :param obs_dim: number of observation dimensions
+    :return: k
+    :raises ValueError: if it is no integer >= 1, or there are not so many points
+    """
+    exact = not isinstance(observation_space, spaces.Box)
+    if isinstance(n_neighbors, str):
+        if n_neighbors != "auto":
+            raise ValueError(f"n_neighbors must be an integer >= 1, or 'auto'; got {n_neighbors!r}")
+        return 1 if exact else min(2 * obs_dim + 1, n_points)
+    k = check_integer("n_neighbors", n_neighbors, 1)
+    if exact and k != 1:
+        raise ValueError(
+            f"n_neighbors must be 1 or 'auto' for a {type(observation_space).__name__} observation space, whose "
+            f"states have no neighbours; got {k}"
+        )
+    if k > n_points:
+        raise ValueError(
+            f"n_neighbors must be at most the number of points, {n_points}; got {k}. "
+            "Give fewer neighbours or more points"
+        )
+    return k
