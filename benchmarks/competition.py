@@ -118,7 +118,8 @@ def main() -> None:
             share = (lengths[:, -LAST_EPISODES:].mean(axis=1) <= WANTED_STEPS).mean()
             print(f"| {sight.what} | {medians} | {share:.0%} of problems |", flush=True)
             stored[sight.what] = lengths.tolist()
-    print(f"\nProblems {problems[0]} to {problems[-1]}.", ", ".join(f"{key} {value}" for key, value in describe().items()))
+    machine = ", ".join(f"{key} {value}" for key, value in describe().items())
+    print(f"\nProblems {problems[0]} to {problems[-1]}. {machine}")
     if arguments.json:
         with open(arguments.json, "w") as file:
             json.dump({"machine": describe(), "problems": list(problems), "lengths": stored}, file)
