@@ -11,12 +11,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_knntd.perception.bounds import MEASURING_STEPS
 from sb3_knntd.checks import check_integer, check_number, check_schedule
 from sb3_knntd.compare.stepwise import StepwiseAlgorithm
 from sb3_knntd.compare.tile_coding import TileCoder
 from sb3_knntd.kernels.jit import jit
-from sb3_knntd.perception.bounds import make_bounds
+from sb3_knntd.perception.bounds import MEASURING_STEPS, make_bounds
 
 #: A trace that has decayed below this is forgotten.
 SMALLEST_TRACE = 1e-10
