@@ -8,15 +8,19 @@ BIN := $(VENV)/bin
 help:  ## Show what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/:/' | column -t -s ':'
 
-# Set up once, and again whenever the project's requirements change.
-$(VENV)/installed: pyproject.toml constraints.txt
+# Set up once, and again whenever the project's requirements change: first what a user has, then what a developer needs.
+$(VENV)/usable: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	$(BIN)/python -m pip check
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[extra]'
 	$(BIN)/python -m sb3_knntd.kernels
 	touch $@
 
-demo: $(VENV)/installed  ## Train KNNTD on MountainCar-v0 and show what it learned
+$(VENV)/installed: $(VENV)/usable
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip check
+	touch $@
+
+demo: $(VENV)/usable  ## Train KNNTD on MountainCar-v0 and show what it learned
 	$(BIN)/sb3-knntd demo
 
 test: $(VENV)/installed  ## Run the tests

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_knntd import KNNTD, DeltaFilter
+from sb3_knntd import KNNTD, DeltaFilter, ExA
 
 
 def main() -> None:
@@ -18,6 +18,7 @@ def main() -> None:
     ):
         model = KNNTD(env_id, policy_kwargs={"dtype": dtype}).learn(1)
         model.predict(np.asarray(model.observation_space.sample()), deterministic=True)
+    ExA("MountainCarContinuous-v0").learn(1)
     env = DeltaFilter(gym.make("MountainCar-v0"))
     env.reset()
     env.step(0)
