@@ -155,7 +155,7 @@ def run_locally(
                 if outcome is not None:
                     yield job, outcome
                 elif attempt < ATTEMPTS:
-                    waiting.append((job, attempt + 1))
+                    waiting.appendleft((job, attempt + 1))
                 else:
                     yield job, Outcome(error=f"its process died {attempt} times: killed, or short of memory")
     finally:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import ray
+from ray.actor import ActorHandle
 from ray.exceptions import GetTimeoutError, RayActorError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -39,10 +42,10 @@ class Board:
         return self._begun[first:]
 
 
-def compute_on_ray(job: Job, board: ray.actor.ActorHandle) -> Outcome:
+def compute_on_ray(job: Job, board: Any) -> Outcome:
     """
     :param job: what to compute, on whichever machine this runs
-    :param board: where to say that it has begun
+    :param board: handle of the :class:`Board` where to say that it has begun
     :return: its outcome
     """
     board.begin.remote(job.key)
@@ -61,8 +64,8 @@ def connected(address: str | None = None) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    options = {} if address or os.environ.get("RAY_ADDRESS") else {"include_dashboard": False}
-    ray.init(address, log_to_driver=False, logging_level="warning", **options)
+    is_there = address or os.environ.get("RAY_ADDRESS")
+    ray.init(address, include_dashboard=None if is_there else False, log_to_driver=False, logging_level=logging.WARNING)
     try:
         yield
     finally:
@@ -87,7 +90,7 @@ def run_on_ray(
     """
     # Where this process runs no node dies without it.
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
-    board = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here).remote()
+    board: ActorHandle[Any] = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here).remote()  # type: ignore[assignment]
     # A process serves one job, and its libraries have one thread.
     task = ray.remote(max_calls=1)(compute_on_ray).options(
         num_cpus=cpus,
@@ -115,17 +118,15 @@ def run_on_ray(
         ray.kill(board)
 
 
-def _begun(board: ray.actor.ActorHandle, n_known: int) -> list[str]:
+def _begun(board: ActorHandle[Any], n_known: int) -> list[str]:
     try:
-        keys: list[str] = ray.get(board.begun.remote(n_known), timeout=LOOK_SECONDS)
+        return list(ray.get(board.begun.remote(n_known), timeout=LOOK_SECONDS))
     except (GetTimeoutError, RayActorError):  # without it only the display knows less
         return []
-    return keys
 
 
-def _outcome(reference: ray.ObjectRef) -> Outcome:
+def _outcome(reference: ray.ObjectRef[Outcome]) -> Outcome:
     try:
-        outcome: Outcome = ray.get(reference)
+        return ray.get(reference)
     except RayError as error:
         return Outcome(error=f"{type(error).__name__}: {error}")
-    return outcome

@@ -504,7 +504,7 @@ def test_fresh_processes(tmp_path: Path) -> None:
         Job("threads", job_functions.threads, {}),
     ]
     events: list[tuple[str, Outcome | None]] = []
-    for job, outcome in run_locally(jobs, 2, fresh=True, preload=["job_functions"]):
+    for job, outcome in run_locally(jobs, 2, fresh=True, preload=["sb3_knntd.jobs", "job_functions"]):
         events.append((job.key, outcome))
         running = {key for key, _ in events} - {key for key, found in events if found}
         assert len(running) <= 2
@@ -525,7 +525,7 @@ from sb3_knntd.jobs import Job, run_jobs, run_locally
 if __name__ == "__main__":
     folder, pids = Path(sys.argv[1]), sys.argv[2]
     jobs = [Job(f"{n}", job_functions.slow, {"seconds": 60 * n, "folder": pids}) for n in range(2)]
-    backend = partial(run_locally, workers=1, fresh=True, preload=["job_functions"])
+    backend = partial(run_locally, workers=1, fresh=True, preload=["sb3_knntd.jobs", "job_functions"])
     run_jobs(jobs, folder, backend=backend)
 """
 

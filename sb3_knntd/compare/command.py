@@ -124,8 +124,8 @@ def compare(
 
     by_key = {key: outcomes[job.key] for key, job in jobs.items()}
     failures = {f"{key.env}, {label(key.algo)}, seed {key.seed}": o.error for key, o in by_key.items() if o.error}
-    for name, error in failures.items():
-        print(f"Failed: {name}\n{error}", file=sys.stderr)
+    for name, reason in failures.items():
+        print(f"Failed: {name}\n{reason}", file=sys.stderr)
     comparison = gather(plan, chosen, by_key, failures)
     if not comparison.tasks:
         print("Nothing came through: no report. The same command tries again.", file=sys.stderr)

@@ -60,8 +60,7 @@ def fits(algo: str, env_id: str) -> bool:
     :param env_id: environment
     :return: whether it can take the environment's actions
     """
-    with gym.make(env_id) as env:
-        return isinstance(env.action_space, ACTIONS.get(algo, spaces.Space))
+    return isinstance(_spaces(env_id)[1], ACTIONS.get(algo, spaces.Space))
 
 
 def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Path]) -> Configuration:
@@ -102,8 +101,13 @@ def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Pat
 def _policy(algo: str, env_id: str) -> str:
     if algo in POLICIES:
         return POLICIES[algo]
-    with gym.make(env_id) as env:
-        space = env.observation_space
+    space, _ = _spaces(env_id)
     if isinstance(space, spaces.Dict):
         return "MultiInputPolicy"
     return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+
+
+def _spaces(env_id: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+    env = gym.make(env_id)
+    env.close()
+    return env.observation_space, env.action_space

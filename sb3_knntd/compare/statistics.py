@@ -71,8 +71,7 @@ def curves(scores: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
 
 def _iqm_by_point(scores: np.ndarray) -> np.ndarray:
     # metrics.aggregate_iqm of each point, all in one go.
-    means: np.ndarray = trim_mean(scores.reshape(-1, scores.shape[-1]), 0.25, axis=0)
-    return means
+    return np.asarray(trim_mean(scores.reshape(-1, scores.shape[-1]), 0.25, axis=0))
 
 
 def aggregates(scores: Mapping[str, np.ndarray]) -> dict[str, Estimate]:

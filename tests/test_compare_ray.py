@@ -1,0 +1,140 @@
+"""Jobs and comparisons on a Ray cluster of several nodes, on loopback, one of which dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import job_functions
+import pytest
+import ray
+from ray._private import ray_constants
+from ray.cluster_utils import Cluster
+
+from sb3_knntd.cli import main
+from sb3_knntd.jobs import Job, Outcome, run_jobs
+from sb3_knntd.ray_jobs import connected, run_on_ray
+
+TESTS = str(Path(__file__).parent)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """A head that computes nothing, and a node; this process is connected."""
+    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # sockets have short names
+    node = {"node_ip_address": "127.0.0.1", "object_store_memory": 80 * 2**20}
+    head = {**node, "num_cpus": 0, "include_dashboard": False, "temp_dir": folder}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        # Where clusters are not meant for several machines, Ray keeps to the loopback address.
+        patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
+        made = Cluster(initialize_head=True, head_node_args=head)
+        made.add_node(num_cpus=1, **node)
+        ray.init(
+            made.address, runtime_env={"env_vars": {"PYTHONPATH": TESTS}}, log_to_driver=False, logging_level="error"
+        )
+        yield made
+        ray.shutdown()
+        made.shutdown()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def wait_until(condition: Any, seconds: float = 90.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.05)
+
+
+def test_a_node_that_dies_costs_nothing(cluster: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    pids = tmp_path / "pids"
+    pids.mkdir()
+    doomed = cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1", object_store_memory=80 * 2**20)
+    jobs = [
+        *(Job(f"slow-{n}", job_functions.slow, {"seconds": 3, "folder": str(pids)}) for n in range(2)),
+        Job("once", job_functions.die, {"marker": str(tmp_path / "once"), "times": 1}),
+        Job("raises", job_functions.fail, {"what": "such thing"}),
+        Job("threads", job_functions.threads, {}),
+    ]
+
+    def kill() -> None:
+        wait_until(lambda: len(list(pids.iterdir())) == 2)
+        cluster.remove_node(doomed, allow_graceful=False)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    outcomes = run_jobs(jobs, tmp_path / "jobs", title="t", backend=run_on_ray)
+    killer.join()
+
+    begun = {int(path.name.split("-")[1]) for path in pids.iterdir()}
+    ended = {outcomes[f"slow-{n}"].result for n in range(2)}
+    assert len(begun) == 3, "no job was begun again"
+    assert len(ended) == 2
+    assert ended < begun
+    assert outcomes["once"] == Outcome("alive after 1")
+    assert "ValueError: there is no such thing" in outcomes["raises"].error
+    alone = outcomes["threads"].result
+    assert (alone["torch"], alone["openmp"]) == (1, "1")
+    assert alone["process"] not in {*begun, os.getpid()}
+    # Each was told of once, and stored.
+    err = capfd.readouterr().err
+    assert [f"t: {n} of 5" in err for n in range(1, 7)] == [True] * 5 + [False]
+    stored = {path.stem: json.loads(path.read_bytes()) for path in (tmp_path / "jobs").iterdir()}
+    assert {key: content.get("result") for key, content in stored.items()} == {
+        key: outcome.result for key, outcome in outcomes.items()
+    }
+
+
+def test_the_backend_does_not_change_what_is_learned(cluster: Cluster, tmp_path: Path) -> None:
+    arguments = ["compare", "--env", "compare/Corridor-v0", "--algos", "knntd", "--seeds", "1", "--steps", "300"]
+    arguments += ["--eval-points", "3", "--eval-episodes", "2", "--gym-packages", "compare_envs"]
+    assert main([*arguments, "--backend", "ray", "--out", str(tmp_path / "ray")]) == 0
+    assert main([*arguments, "--out", str(tmp_path / "local")]) == 0
+    names = sorted(path.name for path in (tmp_path / "ray" / "runs").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "local" / "runs").iterdir())
+    assert len(names) == 2
+    for name in names:
+        there, here = (json.loads((tmp_path / where / "runs" / name).read_bytes()) for where in ("ray", "local"))
+        assert there["arguments"] == here["arguments"]
+        for what in ("steps", "returns", "stds", "versions"):
+            assert there["result"][what] == here["result"][what]
+    # What one has computed the other goes on from.
+    before = {name: (tmp_path / "ray" / "runs" / name).stat().st_mtime_ns for name in names}
+    assert main([*arguments, "--out", str(tmp_path / "ray")]) == 0
+    assert before == {name: (tmp_path / "ray" / "runs" / name).stat().st_mtime_ns for name in names}
+
+
+def test_what_is_interrupted_is_stopped(cluster: Cluster, tmp_path: Path) -> None:
+    pids = tmp_path / "pids"
+    pids.mkdir()
+    events = run_on_ray([Job("slow", job_functions.slow, {"seconds": 600, "folder": str(pids)})])
+    assert next(events)[1] is None
+    wait_until(lambda: list(pids.iterdir()))
+    events.close()
+    (path,) = pids.iterdir()
+    wait_until(lambda: not Path(f"/proc/{path.name.split('-')[1]}").exists())
+
+
+def test_a_cluster_that_is_not_there_is_told_of(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with connected("ray://127.0.0.1:1"):
+        assert ray.is_initialized(), "whoever is connected stays so"
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+
+    def refuse(address: str, **options: Any) -> None:
+        raise ConnectionError(f"no cluster at {address}")
+
+    monkeypatch.setattr(ray, "init", refuse)
+    with pytest.raises(SystemExit, match="2"):
+        main(
+            ["compare", "--env", "CartPole-v1", "--algos", "knntd", "--backend", "ray", "--address", "ray://nowhere:1"]
+        )
+    assert "--address: no cluster at ray://nowhere:1" in capsys.readouterr().err
