@@ -24,7 +24,7 @@ from sb3_knntd import DeltaFilter
 from sb3_knntd.cli import main
 from sb3_knntd.reproduce import FIGURES
 from sb3_knntd.reproduce.curves import episode_lengths
-from sb3_knntd.reproduce.fig4 import SignalRecorder, constant_error
+from sb3_knntd.reproduce.fig4 import SignalRecorder, at_wall, constant_error, ratio_off_wall
 from sb3_knntd.reproduce.fig6 import success
 from sb3_knntd.reproduce.fig7 import FullEpisodeRecorder, mean_change, used_share
 from sb3_knntd.reproduce.settings import ALGORITHMS, load_settings, make_model, total_steps
@@ -166,6 +166,17 @@ def test_what_is_the_same_in_all_observations_counts_as_no_error(parts: dict[str
     uncertainty = 4 * np.std(errors, axis=0) / 20 + 1e-6
     assert (np.abs(np.mean(errors, axis=0) - constant) < uncertainty).all()
     assert (constant != 0).all() == (len(parts) < 2)
+
+
+def test_what_the_wall_does_to_estimates_can_be_left_out() -> None:
+    true = np.tile([-1.0, 0.02], (40, 1))
+    true[[20, 21]] = -1.2, 0.0
+    wrong = np.where(np.arange(40)[:, None] % 2, 0.01, -0.01)
+    signals = {"true": true, "raw": true + wrong, "filtered": true + wrong * [[0.5, 0.25]]}
+    signals["filtered"][19:29, 1] += 1.0
+    lists = {name: signal.tolist() for name, signal in signals.items()}
+    assert np.flatnonzero(at_wall(lists)).tolist() == list(range(19, 29))
+    np.testing.assert_allclose(ratio_off_wall(lists), [0.5, 0.25])
 
 
 def test_signals_are_recorded_by_episode() -> None:
@@ -422,6 +433,29 @@ def test_figure_3_at_its_best(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert len(then) == 30
     assert np.median(then) <= 109
     assert sum(steps <= 105 for steps in then) >= 5
+
+
+@pytest.mark.slow
+def test_figure_4_with_the_paper_s_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At first Algorithm 5 adds error; at last it takes some out of the position, and none out of the velocity."""
+    assert main(["reproduce", "fig4", "--out", str(tmp_path)]) == 0
+    table = rows(tmp_path / "fig4" / "paper" / "table.csv")
+    first = [float(row["filtered"]) / float(row["raw"]) for row in table if row["episode"] == "1"]
+    assert np.median(first) > 2
+    assert 0.65 < np.median(late_ratios(table, "position")) < 0.85
+    assert np.median(late_ratios(table, "velocity")) > 1
+
+
+@pytest.mark.slow
+def test_figure_4_at_its_best(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reproduce", "fig4", "--best", "--out", str(tmp_path)]) == 0
+    table = rows(tmp_path / "fig4" / "best" / "table.csv")
+    first = [float(row["filtered"]) / float(row["raw"]) for row in table if row["episode"] == "1"]
+    assert np.median(first) < 1
+    position = late_ratios(table, "position")
+    assert len(position) == 30
+    assert max(position) < 0.5
+    assert np.median(late_ratios(table, "velocity")) < 1
 
 
 @pytest.mark.slow

@@ -48,15 +48,16 @@ def curve_tables(results: Results) -> dict[str, Table]:
     return {"table.csv": Table(("algorithm", "seed", "episode", "steps"), rows)}
 
 
-def draw_curves(axes: Axes, curves: np.ndarray) -> None:
+def draw_curves(axes: Axes, curves: np.ndarray, alpha: float = 0.25) -> None:
     """
     Draw every seed faint, and in each episode their median, bold, and the range between the 10 % and 90 % quantiles.
 
     :param axes: where to draw
-    :param curves: steps of each episode, shape (n_seeds, n_episodes)
+    :param curves: steps, or another figure, of each episode, shape (n_seeds, n_episodes)
+    :param alpha: opacity of the seeds' lines, in [0, 1]
     """
     episodes = np.arange(1, curves.shape[1] + 1)
-    axes.plot(episodes, curves.T, color=LINE_COLOR, alpha=0.25, linewidth=0.7)
+    axes.plot(episodes, curves.T, color=LINE_COLOR, alpha=alpha, linewidth=0.7)
     low, median, high = np.quantile(curves, (LOW, 0.5, HIGH), axis=0)
     axes.fill_between(episodes, low, high, color=LINE_COLOR, alpha=0.2, linewidth=0, label="10 % to 90 % of seeds")
     axes.plot(episodes, median, color=LINE_COLOR, linewidth=2.2, label="median")

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_knntd.envs.generalized_mountain_car import NOISE_SHAPE, RANGES, GeneralizedMountainCarEnv
+from sb3_knntd.envs.mountain_car import MIN_POSITION
 from sb3_knntd.filters import DeltaFilter
 from sb3_knntd.plots import BASELINE_COLOR, LINE_COLOR, new_figure
 from sb3_knntd.reproduce.curves import draw_curves
@@ -29,6 +30,8 @@ LATE = 20
 MOST_DRAWN = 120
 #: Of the error that is in observations, a filter that takes out a high amount leaves at most so much.
 HALF = 0.5
+#: Where the car hits the left wall its velocity jumps to 0: steps before and after that in which estimates feel it.
+BEFORE_WALL, AFTER_WALL = 1, 7
 #: Mean of the noise in widths of position and velocity over their noise divider.
 MEAN_NOISE = NOISE_SHAPE[0] / sum(NOISE_SHAPE) - 0.5
 
@@ -140,6 +143,30 @@ def late_ratio(result: dict[str, Any]) -> np.ndarray:
     return left
 
 
+def at_wall(signals: dict[str, list[list[float]]]) -> np.ndarray:
+    """
+    :param signals: of an episode
+    :return: which observations are from one step before to seven steps after the car stands at the left wall, shape
+        (n_steps + 1,)
+    """
+    true = np.array(signals["true"])
+    near = np.zeros(len(true), np.bool_)
+    for step in np.flatnonzero(true[:, 0] == MIN_POSITION).tolist():
+        near[max(step - BEFORE_WALL, 0) : step + AFTER_WALL + 1] = True
+    return near
+
+
+def ratio_off_wall(signals: dict[str, list[list[float]]]) -> np.ndarray:
+    """
+    :param signals: of an episode
+    :return: the error of the filtered over that of the raw signal in the observations that are not at the wall, shape
+        (2,)
+    """
+    true, raw, filtered = (np.array(signals[name])[~at_wall(signals)] for name in SIGNALS)
+    left: np.ndarray = root_mean_square(filtered - true) / root_mean_square(raw - true)
+    return left
+
+
 def tables(results: Results) -> dict[str, Table]:
     """
     :param results: errors and signals of each seed
@@ -213,7 +240,7 @@ def _draw_signals(axes: Axes, signals: dict[str, list[list[float]]], dim: int) -
 def _draw_ratios(axes: Axes, lefts: np.ndarray) -> None:
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
-    draw_curves(axes, lefts)
+    draw_curves(axes, lefts, alpha=0.1)
     axes.axhline(1.0, color="black", linestyle="--", linewidth=1.2, label="no filter")
     axes.set_yscale("log")
     axes.set_yticks((0.25, 0.5, 1, 2, 4))
@@ -246,6 +273,15 @@ def verdict(results: Results) -> str:
             f"{LATE} of {n_episodes}. Noise is taken out (median below 1; so in {n_less} of {len(after)} seeds): "
             f"{yes_no(middle < 1)}; half of it or more: {yes_no(middle <= HALF)}."
         )
+    last = [result["signals"]["last"] for result in by_seed.values()]
+    off_wall = np.array([ratio_off_wall(signals) for signals in last])
+    n_hit = sum(bool(at_wall(signals).any()) for signals in last)
+    sentences.append(
+        f"Where the car hits the left wall its velocity jumps to 0. {n_hit} of {len(last)} seeds hit it in the last "
+        f"episode. Without the steps there, from {BEFORE_WALL} before to {AFTER_WALL} after, the medians in that "
+        f"episode are {interval(off_wall[:, 0].tolist())} for the position and {interval(off_wall[:, 1].tolist())} for "
+        "the velocity."
+    )
     steps = [float(np.mean(result["steps"][-LATE:])) for result in by_seed.values()]
     sentences.append(
         f"kNN-TD(λ), which learns from what the filter returns, takes {interval(steps)} steps an episode in the mean "
