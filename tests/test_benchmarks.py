@@ -11,6 +11,13 @@ import sys
 from typing import Any
 
 import pytest
+import yaml
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_knntd import KNNTD, cli
+from sb3_knntd.jobs import Job, Outcome
 
 ROOT = pathlib.Path(__file__).parent.parent
 
@@ -135,3 +142,95 @@ def test_learning_has_the_tables_of_the_issue(benchmarks: Any) -> None:
     # 64 environments are compared with one over the same number of steps.
     assert {case.n_envs for case in tables["envs"]} >= {1, 64}
     assert len({(case.env_id, case.steps) for case in tables["envs"]}) == 1
+
+
+def test_the_zoo_benchmark_trains_as_the_command_does(
+    benchmarks: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {
+        "n_timesteps": 1000.0,
+        "policy": "KNNPolicy",
+        "bounds": [[-2.4, -3.0, -0.21, -3.0], [2.4, 3.0, 0.21, 3.0]],
+        "learning_rate": "lin_0.5_0.1",
+        "n_envs": 2,
+    }
+    played = benchmarks("zoo").play("knntd", "CartPole-v1", settings, seed=3, episodes=5)
+
+    config = tmp_path / "config.yml"
+    config.write_text(yaml.safe_dump({"CartPole-v1": settings}))
+    arguments = ["--seed", "3", "--eval-freq", "-1", "--conf-file", str(config), "-f", str(tmp_path)]
+    assert cli.main(["train", "--algo", "knntd", "--env", "CartPole-v1", *arguments]) == 0
+    model = KNNTD.load(tmp_path / "knntd" / "CartPole-v1_1" / "CartPole-v1.zip")
+    returns, _ = evaluate_policy(model, make_vec_env("CartPole-v1", 10, seed=10_003), 5, return_episode_rewards=True)
+    assert (model.policy.q_table != 0).any()
+    assert played["returns"] == returns
+    assert played["seconds"] > 0.0
+
+
+def test_the_zoo_benchmark_evaluates_through_the_filter_that_was_learned(benchmarks: Any) -> None:
+    zoo = benchmarks("zoo")
+    settings = {
+        "n_timesteps": 100.0,
+        "policy": "KNNPolicy",
+        "vec_env_wrapper": {"sb3_knntd.VecDeltaFilter": {"bounds": "adaptive"}},
+    }
+    seen = []
+
+    def evaluate(model: Any, envs: VecEnv, *_: Any, **__: Any) -> tuple[list[float], list[int]]:
+        seen.append((model.env, envs))
+        return [0.0], [1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(zoo, "evaluate_policy", evaluate)
+        zoo.play("knntd", "MountainCar-v0", settings, seed=0, episodes=1)
+    ((training, evaluation),) = seen
+    assert evaluation.table is training.table
+    assert not evaluation.training
+
+
+def test_the_zoo_benchmark_refuses_endless_episodes(benchmarks: Any) -> None:
+    settings = {"n_timesteps": 10.0, "policy": "KNNPolicy"}
+    with pytest.raises(ValueError, match=r"CliffWalking-v1 has no limit of steps.*TimeLimit"):
+        benchmarks("zoo").play("knntd", "CliffWalking-v1", settings, seed=0, episodes=1)
+
+
+def test_the_zoo_benchmark_stands_beside_published_figures(benchmarks: Any) -> None:
+    zoo = benchmarks("zoo")
+    row = zoo.Row("knntd", "LunarLander-v3", 500_000, [7, 8], [[100.0, 300.0], [0.0, 0.0]], [2.0, 4.0])
+    _, _, ours, *theirs = zoo.table([row]).splitlines()
+    assert [cell.strip() for cell in ours.strip("|").split("|")] == [
+        *("**knntd**", "LunarLander-v3", "100.0", "122.5", "100.0 [20.0, 180.0]", "500k", "2", "4", "3 s")
+    ]
+    assert len(theirs) == 3
+    assert "| ppo | LunarLander-v2 | 242.1 | 31.8 |  | 1M | 1 |" in theirs[2]
+    # Mountain-Car of the paper is another environment than gymnasium's.
+    assert len(zoo.table([row._replace(env_id="sb3_knntd/MountainCar-v0")]).splitlines()) == 3
+
+
+def test_the_zoo_benchmark_writes_what_was_learned_and_tells_what_failed(
+    benchmarks: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
+) -> None:
+    zoo = benchmarks("zoo")
+
+    def outcomes(jobs: list[Job], *_: Any) -> dict[str, Outcome]:
+        learned = {job.key: Outcome({"returns": [-100.0, -110.0], "seconds": 1.0}) for job in jobs}
+        return learned | {"knntd-MountainCar-v0-6": Outcome(error="Traceback\nImportError: no simulator\n")}
+
+    monkeypatch.setattr(zoo, "run_jobs", outcomes)
+    page, stored = tmp_path / "benchmark.md", tmp_path / "benchmark.json"
+    command = ["--env", "MountainCar-v0", "--seeds", "10", "MountainCar-v0=3", "--first-seed", "5"]
+    monkeypatch.setattr(sys, "argv", ["zoo", *command, "--markdown", str(page), "--json", str(stored)])
+    with pytest.raises(SystemExit, match="knntd-MountainCar-v0-6: ImportError: no simulator"):
+        zoo.main()
+    (row,) = json.loads(stored.read_text())["rows"]
+    assert row["seeds"] == [5, 7]
+    assert row["returns"] == [[-100.0, -110.0]] * 2
+    assert f"python -m benchmarks.zoo {' '.join(command)}" in page.read_text()
+    assert "| **knntd** | MountainCar-v0 | -105.0 | 5.0 | -105.0 [-105.0, -105.0] |" in page.read_text()
+
+
+@pytest.mark.parametrize("words", ["0", "ten", "MountainCar-v0=", "=3", "MountainCar-v0=0", "Elsewhere-v0=3"])
+def test_the_zoo_benchmark_refuses_seeds(benchmarks: Any, monkeypatch: pytest.MonkeyPatch, words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["zoo", "--seeds", words])
+    with pytest.raises(SystemExit, match="2"):
+        benchmarks("zoo").main()

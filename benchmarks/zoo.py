@@ -1,0 +1,357 @@
+"""
+The configurations of ``zoo_configs/`` beside RL Zoo's published figures.
+
+    python -m benchmarks.zoo [--env ID ...] [--seeds N [ID=N ...]] [--first-seed 100] [--workers N] [--runs FOLDER]
+                             [--json FILE] [--markdown FILE]
+
+For each environment of ``knntd.yml`` and ``exa.yml`` an agent is trained with each seed, as ``sb3-knntd train`` does
+it, and then plays 100 greedy episodes in environments of its own. A run is kept in the folder and not done again until
+its configuration changes; after a change of the algorithms themselves, take another folder. What fails, for want of a
+simulator say, is told in the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import shlex
+import statistics
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
+
+from benchmarks.machine import describe
+from sb3_knntd import VecDeltaFilter
+from sb3_knntd.files import replace_file
+from sb3_knntd.jobs import Job, run_jobs
+from sb3_knntd.zoo import register
+from sb3_knntd.zoo.experiment import KNNExperimentManager
+
+ALGORITHMS = ("knntd", "exa")
+EPISODES, EVALUATION_ENVS = 100, 10
+#: Environments for evaluation are seeded apart from those for training.
+EVALUATION_SEED = 10_000
+
+#: Where RL Zoo's figures are from.
+SOURCE = "https://github.com/DLR-RM/rl-baselines3-zoo/blob/0088472b8cb622732bdbc4aa3d0d0abde86c67ed/benchmark.md"
+
+
+class Published(NamedTuple):
+    """
+    A line of RL Zoo's table, which is one run.
+
+    :param algo: algorithm
+    :param env_id: environment, in the version of that time
+    :param mean_reward: mean return
+    :param std_reward: standard deviation over episodes
+    :param n_timesteps: steps of the training
+    """
+
+    algo: str
+    env_id: str
+    mean_reward: float
+    std_reward: float
+    n_timesteps: int
+
+
+PUBLISHED = (
+    Published("dqn", "MountainCar-v0", -100.849, 9.925, 120_000),
+    Published("qrdqn", "MountainCar-v0", -106.042, 15.536, 120_000),
+    Published("ppo", "MountainCar-v0", -110.423, 19.473, 1_000_000),
+    Published("dqn", "CartPole-v1", 500.0, 0.0, 50_000),
+    Published("qrdqn", "CartPole-v1", 500.0, 0.0, 50_000),
+    Published("ppo", "CartPole-v1", 500.0, 0.0, 100_000),
+    Published("dqn", "Acrobot-v1", -76.639, 11.752, 100_000),
+    Published("qrdqn", "Acrobot-v1", -69.135, 9.967, 100_000),
+    Published("ppo", "Acrobot-v1", -73.506, 18.201, 1_000_000),
+    Published("dqn", "LunarLander-v2", 154.382, 79.241, 100_000),
+    Published("qrdqn", "LunarLander-v2", 70.236, 225.491, 100_000),
+    Published("ppo", "LunarLander-v2", 242.119, 31.823, 1_000_000),
+    Published("ppo", "Pendulum-v1", -172.225, 104.159, 100_000),
+    Published("sac", "Pendulum-v1", -156.995, 88.714, 20_000),
+    Published("ppo", "MountainCarContinuous-v0", 88.343, 2.572, 20_000),
+    Published("sac", "MountainCarContinuous-v0", 94.679, 1.134, 50_000),
+    Published("tqc", "MountainCarContinuous-v0", 63.641, 45.259, 50_000),
+    Published("ppo", "LunarLanderContinuous-v2", 270.863, 32.072, 1_000_000),
+    Published("sac", "LunarLanderContinuous-v2", 260.390, 65.467, 500_000),
+    Published("tqc", "LunarLanderContinuous-v2", 277.956, 25.466, 500_000),
+)
+
+
+class Row(NamedTuple):
+    """
+    What was learned in one environment.
+
+    :param algo: algorithm
+    :param env_id: environment
+    :param n_timesteps: steps of each training
+    :param seeds: one for each training
+    :param returns: of each episode, shape (n_seeds, n_episodes)
+    :param seconds: duration of each training
+    """
+
+    algo: str
+    env_id: str
+    n_timesteps: int
+    seeds: list[int]
+    returns: list[list[float]]
+    seconds: list[float]
+
+
+def configurations() -> dict[tuple[str, str], dict[str, Any]]:
+    """
+    :return: what the two files of ``zoo_configs/`` have for an environment, by algorithm and environment
+    """
+    folder = files("sb3_knntd.zoo_configs")
+    stored = {algo: yaml.safe_load(folder.joinpath(f"{algo}.yml").read_text()) for algo in ALGORITHMS}
+    return {
+        (algo, env_id): settings
+        for algo, by_env in stored.items()
+        for env_id, settings in by_env.items()
+        if env_id != "default"
+    }
+
+
+def play(algo: str, env_id: str, settings: Mapping[str, Any], seed: int, episodes: int) -> dict[str, Any]:
+    """
+    :param algo: algorithm
+    :param env_id: environment
+    :param settings: its configuration, in RL Zoo's form
+    :param seed: of the training; evaluation has another
+    :param episodes: how many are played greedily
+    :return: ``"returns"`` of the episodes, and the ``"seconds"`` that training took
+    :raises ValueError: if nothing ends an episode
+    """
+    register()
+    with TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        config = Path(folder, "config.yml")
+        config.write_text(yaml.safe_dump({env_id: dict(settings)}))
+        set_random_seed(seed)
+        manager = KNNExperimentManager(
+            argparse.Namespace(), algo, env_id, folder, eval_freq=-1, seed=seed, log_interval=-2, config=str(config)
+        )
+        model, _ = manager.setup_experiment()  # type: ignore[misc]
+        evaluation = _evaluation_envs(manager, model, EVALUATION_SEED + seed)
+        start = time.perf_counter()
+        manager.learn(model)
+        seconds = time.perf_counter() - start
+        returns, _ = evaluate_policy(model, evaluation, episodes, deterministic=True, return_episode_rewards=True)
+        evaluation.close()
+    return {"returns": returns, "seconds": seconds}
+
+
+def _evaluation_envs(manager: KNNExperimentManager, model: BaseAlgorithm, seed: int) -> VecEnv:
+    """Environments as those of the training, with its filter if it has one, which does not learn there."""
+    assert model.env is not None
+    manager.seed, manager.eval_env_kwargs = seed, manager.env_kwargs
+    learned_filter = unwrap_vec_wrapper(model.env, VecDeltaFilter)
+    if learned_filter is not None:
+        manager.vec_env_wrapper = learned_filter.for_evaluation
+    envs = manager.create_envs(EVALUATION_ENVS, eval_env=True)
+    if not all(envs.env_is_wrapped(gym.wrappers.TimeLimit)):
+        raise ValueError(
+            f"{manager.env_name.gym_id} has no limit of steps, and a greedy policy may go on for ever: give its "
+            "configuration an env_wrapper, gymnasium.wrappers.TimeLimit"
+        )
+    return envs
+
+
+def jobs(algo: str, env_id: str, settings: Mapping[str, Any], seeds: Sequence[int]) -> list[Job]:
+    """
+    :param algo: algorithm
+    :param env_id: environment
+    :param settings: its configuration
+    :param seeds: one for each job
+    :return: what is to be played
+    """
+    name = env_id.replace("/", "-")
+    arguments = {"algo": algo, "env_id": env_id, "settings": settings, "episodes": EPISODES}
+    return [Job(f"{algo}-{name}-{seed}", play, arguments | {"seed": seed}) for seed in seeds]
+
+
+def line(row: Row) -> list[str]:
+    """
+    :param row: what was learned
+    :return: its line of the table
+    """
+    low, median, high = np.quantile(np.mean(row.returns, axis=1), (0.1, 0.5, 0.9))
+    return [
+        f"**{row.algo}**",
+        row.env_id,
+        f"{np.mean(row.returns):.1f}",
+        f"{np.std(row.returns):.1f}",
+        f"{median:.1f} [{low:.1f}, {high:.1f}]",
+        steps(row.n_timesteps),
+        str(len(row.seeds)),
+        str(np.size(row.returns)),
+        f"{statistics.median(row.seconds):.3g} s",
+    ]
+
+
+def published_line(figure: Published) -> list[str]:
+    """
+    :param figure: of RL Zoo
+    :return: its line of the table
+    """
+    reward = [f"{figure.mean_reward:.1f}", f"{figure.std_reward:.1f}"]
+    return [figure.algo, figure.env_id, *reward, "", steps(figure.n_timesteps), "1", "", ""]
+
+
+def steps(number: int) -> str:
+    """
+    :param number: of steps
+    :return: as RL Zoo has it, ``20k`` or ``1M``
+    """
+    return f"{number / 1e6:g}M" if number >= 1_000_000 else f"{number / 1e3:g}k"
+
+
+def table(rows: Sequence[Row]) -> str:
+    """
+    :param rows: what was learned
+    :return: table in Markdown, each line followed by RL Zoo's on the environment of that name, whatever its version
+    """
+    names = ["algo", "env_id", "mean_reward", "std_reward", "median [10 %, 90 %]"]
+    names += ["n_timesteps", "seeds", "eval_episodes", "training"]
+    lines = [names, ["---", "---", *["---:"] * 7]]
+    for row in rows:
+        lines.append(line(row))
+        name = row.env_id.rpartition("-")[0]
+        lines += [published_line(figure) for figure in PUBLISHED if figure.env_id.rpartition("-")[0] == name]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def page(rows: Sequence[Row], command: str) -> str:
+    """
+    :param rows: what was learned
+    :param command: what made them
+    :return: page in Markdown
+    """
+    machine = ", ".join(f"{key} {value}" for key, value in describe().items())
+    first, last = min(min(row.seeds) for row in rows), max(max(row.seeds) for row in rows)
+    return f"""# Benchmark
+
+The configurations of `zoo_configs/knntd.yml` and `exa.yml` in RL Zoo's form: mean and standard deviation of the return
+over all greedy episodes of all seeds, {EPISODES} for each seed. Then the median over seeds of a seed's mean return,
+with the 10 % and 90 % quantiles. Training is the wall-clock time of one training, the median over seeds. Seeds are
+{first} to {last}, others than those the configurations were tuned on.
+
+Lines with one seed and no time are RL Zoo's, from its
+[benchmark.md]({SOURCE}),
+which are one run each and show what can be reached. They are of the environments' versions of that time, which can
+differ a little from today's. Where there is no such line RL Zoo has published none.
+
+{table(rows)}
+
+Made by
+
+```bash
+pip install ".[zoo]" "gymnasium[box2d,mujoco,toy-text]"
+{command}
+```
+
+on {machine}.
+"""
+
+
+def seeds_of(words: Sequence[str]) -> tuple[int, dict[str, int]]:
+    """
+    :param words: a number of seeds, and exceptions as ``ID=N``
+    :return: the number, and the exceptions by environment
+    :raises ValueError: if a word is neither, or a number is below 1
+    """
+    number, exceptions = 10, {}
+    for word in words:
+        env_id, equals, count = word.rpartition("=")
+        if not count.isdecimal() or int(count) < 1 or (equals and not env_id):
+            raise ValueError(f"--seeds takes a number >= 1 or ID=NUMBER; got {word!r}")
+        if equals:
+            exceptions[env_id] = int(count)
+        else:
+            number = int(count)
+    return number, exceptions
+
+
+def learn(
+    seeds: Mapping[tuple[str, str], Sequence[int]], runs: Path, workers: int | None
+) -> tuple[list[Row], dict[str, str]]:
+    """
+    :param seeds: of the configurations that are wanted
+    :param runs: folder where runs are kept
+    :param workers: number of processes; by default one a core
+    :return: what was learned, and by job why it could not be
+    """
+    known = configurations()
+    wanted = {(algo, env_id): jobs(algo, env_id, known[algo, env_id], some) for (algo, env_id), some in seeds.items()}
+    outcomes = run_jobs([job for some in wanted.values() for job in some], runs, workers, "benchmark")
+    rows = []
+    for (algo, env_id), some in wanted.items():
+        done = [(job, outcomes[job.key].result) for job in some if not outcomes[job.key].error]
+        if done:
+            rows.append(
+                Row(
+                    algo,
+                    env_id,
+                    int(known[algo, env_id]["n_timesteps"]),
+                    [job.arguments["seed"] for job, _ in done],
+                    [result["returns"] for _, result in done],
+                    [result["seconds"] for _, result in done],
+                )
+            )
+    return rows, {key: outcome.error for key, outcome in outcomes.items() if outcome.error}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    known = configurations()
+    env_ids = list(dict.fromkeys(env_id for _, env_id in known))
+    parser.add_argument("--env", nargs="+", choices=env_ids, metavar="ID", help=", ".join(env_ids))
+    parser.add_argument("--seeds", nargs="+", default=["10"], metavar="N", help="number of seeds, and exceptions: ID=N")
+    parser.add_argument("--first-seed", type=int, default=100, help="the configurations were tuned on others")
+    parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
+    parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"), help="folder where runs are kept")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also store the returns of all episodes")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the page of the documentation")
+    arguments = parser.parse_args()
+    try:
+        number, exceptions = seeds_of(arguments.seeds)
+    except ValueError as error:
+        parser.error(str(error))
+    if unknown := sorted(exceptions.keys() - set(env_ids)):
+        parser.error(f"--seeds: no configuration for {', '.join(unknown)}; there are {', '.join(env_ids)}")
+
+    first = arguments.first_seed
+    seeds = {
+        (algo, env_id): range(first, first + exceptions.get(env_id, number))
+        for algo, env_id in known
+        if env_id in (arguments.env or env_ids)
+    }
+    register()
+    rows, errors = learn(seeds, arguments.runs, arguments.workers)
+    if rows:
+        print(table(rows))
+        if arguments.json:
+            stored = {"machine": describe(), "rows": [row._asdict() for row in rows]}
+            replace_file(arguments.json, json.dumps(stored).encode())
+        if arguments.markdown:
+            command = f"python -m benchmarks.zoo {shlex.join(sys.argv[1:])}"
+            replace_file(arguments.markdown, page(rows, command).encode())
+    if errors:
+        sys.exit("\n".join(f"{key}: {error.strip().splitlines()[-1]}" for key, error in errors.items()))
+
+
+if __name__ == "__main__":
+    main()
