@@ -71,7 +71,7 @@ def task(
 
 def comparison(*tasks: Task, **more: Any) -> Comparison:
     n_seeds = len(next(iter(tasks[0].runs.values())))
-    chosen = {(t.env, algo): Configuration({"policy": "x"}, "somewhere", 9) for t in tasks for algo in t.runs}
+    chosen = {(t.env, algo): Configuration({"policy": "x"}, "somewhere", 299) for t in tasks for algo in t.runs}
     fields = {"failures": {}, "notes": [], **more}
     return Comparison(list(tasks), make_groups(tasks), chosen, "the command", range(n_seeds), 300, 3, 2, **fields)
 
@@ -393,6 +393,10 @@ def test_statistics_are_those_of_rliable() -> None:
 def test_the_reader_is_told_what_to_read_with_care() -> None:
     runs = {"knntd": [[0.0, 90.0, 120.0]] * 5, "random": [[0.0, 0.0, 0.0]] * 5}
     assert cautions(comparison(task(runs))) == []
+    one = comparison(task(runs))
+    long = {key: found._replace(tuned_steps=301) for key, found in one.configurations.items() if key[1] == "knntd"}
+    (short,) = cautions(one._replace(configurations={**one.configurations, **long}))
+    assert short == "Some configurations were made for more than 300 steps: kNN-TD(λ) on CartPole-v1 for 301."
     (few,) = cautions(comparison(task({**runs, "knntd": runs["knntd"][:4]})))
     assert few.startswith("Fewer than 5 seeds: the intervals mean little")
     (busy,) = cautions(comparison(task(runs, cpu_seconds=0.6)))
@@ -410,7 +414,7 @@ def test_the_report_tells_of_costs_failures_and_configurations() -> None:
     runs = {"knntd": [[0.0, 90.0, 120.0]] * 5, "random": [[0.0, 0.0, 0.0]] * 5}
     told = comparison(task(runs), failures={"<run>": "why & how"}, notes=["DQN cannot."])
     page = make_report(told)["report.html"].decode()
-    for words in ("never", "5 of 5", "made for 9 steps", "Failed: &lt;run&gt;", "why &amp; how", "DQN cannot."):
+    for words in ("never", "5 of 5", "made for 299 steps", "Failed: &lt;run&gt;", "why &amp; how", "DQN cannot."):
         assert words in page
 
 

@@ -114,7 +114,7 @@ def draw_profiles(thresholds: np.ndarray, lines: Mapping[str, Estimate], palette
     figure, axes = _new_axes()
     for algo, line in lines.items():
         _draw_line(axes, thresholds, line, algo, palette[algo], steps=True)
-    axes.set(xlabel="final score τ", ylabel="share of runs above τ", ylim=(-0.02, 1.02))
+    axes.set(xlabel="final score τ", ylabel="share of runs above τ", ylim=(-0.04, 1.04))
     axes.set_xlim(thresholds[0], thresholds[-1])
     _add_legend(figure, axes)
     return figure

@@ -293,9 +293,10 @@ class _Pictures:
 
 def _task_text(task: Task) -> str:
     if task.threshold is None:
-        return f"No threshold is known. Acting at random returns {task.floor:.1f} on average."
+        return f"No threshold is known. Acting at random returns {_number(task.floor)} on average."
     return (
-        f"Threshold: a return of {task.threshold:g} (dashed). Acting at random returns {task.floor:.1f} on average. "
+        f"Threshold: a return of {_number(task.threshold)} (dashed). Acting at random returns {_number(task.floor)} on "
+        "average. "
         "Costs up to the threshold are medians over all seeds; never, if fewer than half of them reached it."
     )
 
@@ -330,7 +331,7 @@ def _group_view(
 ) -> dict[str, Any]:
     envs = ", ".join(task.env for task in group.tasks)
     tops = "; ".join(
-        f"{task.env}: {task.floor:.1f} and {task.top:.1f}"
+        f"{task.env}: {_number(task.floor)} and {_number(task.top)}"
         + ("" if task.top == task.threshold else " (the best mean at the end, for want of a threshold)")
         for task in group.tasks
     )
@@ -400,17 +401,24 @@ def cautions(comparison: Comparison) -> list[str]:
     :return: what of it is to be read with care, a sentence or two each
     """
     every = [run for task in comparison.tasks for runs in task.runs.values() for run in runs]
-    found = []
+    words = []
     fewest = min(len(runs) for task in comparison.tasks for runs in task.runs.values())
     if fewest < FEWEST_SEEDS:
-        found.append(
+        words.append(
             f"Fewer than {FEWEST_SEEDS} seeds: the intervals mean little. They are drawn from so few values that they "
             "are too narrow more often than not."
         )
     if len(_distinct(json.dumps(run.result["versions"]) for run in every)) > 1:
-        found.append("These results were made by different versions of the software.")
+        words.append("These results were made by different versions of the software.")
     if len(_distinct(json.dumps(run.result["machine"]) for run in every)) > 1:
-        found.append("These results were made on different machines: times do not compare.")
+        words.append("These results were made on different machines: times do not compare.")
+    short = [
+        f"{label(algo)} on {env} for {found.tuned_steps:,}"
+        for (env, algo), found in comparison.configurations.items()
+        if (found.tuned_steps or 0) > comparison.steps
+    ]
+    if short:
+        words.append(f"Some configurations were made for more than {comparison.steps:,} steps: {', '.join(short)}.")
     busy = [
         share
         for task in comparison.tasks
@@ -418,11 +426,11 @@ def cautions(comparison: Comparison) -> list[str]:
         if (share := median(run.cpu_share for run in runs)) < BUSY_SHARE
     ]
     if busy:
-        found.append(
+        words.append(
             f"The machine was busy with other work: some runs had no more than {min(busy):.2f} of a core. Seconds and "
             "steps/s tell of that as well."
         )
-    return found
+    return words
 
 
 def _source(configuration: Configuration, steps: int) -> str:
@@ -451,6 +459,10 @@ def _method(comparison: Comparison) -> list[str]:
         f"Without a tuned configuration an algorithm has its defaults. {label(FLOOR)} draws its actions from the "
         "action space.",
     ]
+
+
+def _number(value: float) -> str:
+    return f"{value:.1f}".replace("-", "−")
 
 
 def _distinct(values: Iterator[str]) -> list[str]:
