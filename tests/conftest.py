@@ -14,20 +14,45 @@ import pytest
 import torch as th
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
-from toy_envs import DriftEnv
+from toy_envs import DriftEnv, PushEnv
 
-from sb3_knntd import KNNTD
+import sb3_knntd.envs  # noqa: F401  registers the continuous cart-pole
+from sb3_knntd import KNNTD, ExA
 
 # Every operation here is tiny: more threads only wait for each other, the more so under pytest-xdist.
 th.set_num_threads(1)
 
 
-def _monitored_drift(**kwargs: Any) -> gym.Env[Any, Any]:
-    return Monitor(DriftEnv(**kwargs))
+@pytest.fixture
+def algorithm() -> type[KNNTD | ExA]:
+    """Whose models ``make_model`` makes: a module whose tests hold for both overrides this to run over both."""
+    return KNNTD
 
 
 @pytest.fixture
-def make_venv() -> Iterator[Callable[..., VecEnv]]:
+def env_cls(algorithm: type[KNNTD | ExA]) -> type[DriftEnv]:
+    """The drifting point with the actions that the algorithm takes."""
+    return PushEnv if algorithm is ExA else DriftEnv
+
+
+@pytest.fixture
+def mountain_car(algorithm: type[KNNTD | ExA]) -> str:
+    """The id of the mountain car with the actions that the algorithm takes: gymnasium's own, with chance in it."""
+    return "MountainCarContinuous-v0" if algorithm is ExA else "MountainCar-v0"
+
+
+@pytest.fixture
+def cart_pole(algorithm: type[KNNTD | ExA]) -> str:
+    """The id of the cart-pole with the actions that the algorithm takes: two of its dimensions have no range."""
+    return "sb3_knntd/ContinuousCartPole-v0" if algorithm is ExA else "CartPole-v1"
+
+
+def _monitored(env_cls: type[DriftEnv], **kwargs: Any) -> gym.Env[Any, Any]:
+    return Monitor(env_cls(**kwargs))
+
+
+@pytest.fixture
+def make_venv(env_cls: type[DriftEnv]) -> Iterator[Callable[..., VecEnv]]:
     """Makes ``make_venv(n_envs, vec_env_cls)``: drifting points whose episodes have 9, 14 and 6 steps, in turn."""
     made: list[VecEnv] = []
 
@@ -35,7 +60,9 @@ def make_venv() -> Iterator[Callable[..., VecEnv]]:
         n_envs: int = 1, vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv, **kwargs: Any
     ) -> VecEnv:
         # An offset each, or all environments would live through the same.
-        made.append(vec_env_cls([partial(_monitored_drift, offset=0.23 * index, **kwargs) for index in range(n_envs)]))
+        made.append(
+            vec_env_cls([partial(_monitored, env_cls, offset=0.23 * index, **kwargs) for index in range(n_envs)])
+        )
         return made[-1]
 
     yield make
@@ -44,12 +71,12 @@ def make_venv() -> Iterator[Callable[..., VecEnv]]:
 
 
 @pytest.fixture
-def make_model(make_venv: Callable[..., VecEnv]) -> Callable[..., KNNTD]:
+def make_model(algorithm: type[KNNTD | ExA], make_venv: Callable[..., VecEnv]) -> Callable[..., KNNTD | ExA]:
     """Makes ``make_model(env, **arguments)``: a model with 48 points, by default of one drifting point, seed 0."""
 
-    def make(env: Any = None, **kwargs: Any) -> KNNTD:
+    def make(env: Any = None, **kwargs: Any) -> KNNTD | ExA:
         # Named, that no test hangs on a default that may be found better one day.
-        arguments = {
+        arguments: dict[str, Any] = {
             "points": (8, 6),
             "bounds": (DriftEnv.LOW, DriftEnv.HIGH),
             "n_neighbors": 4,
@@ -58,7 +85,9 @@ def make_model(make_venv: Callable[..., VecEnv]) -> Callable[..., KNNTD]:
             "exploration_final_eps": 0.0,
             "seed": 0,
         }
-        return KNNTD(make_venv() if env is None else env, **{**arguments, **kwargs})
+        if algorithm is ExA:
+            arguments |= {"action_points": 3, "exploration_hold": 2.0}
+        return algorithm(make_venv() if env is None else env, **{**arguments, **kwargs})
 
     return make
 

@@ -24,10 +24,17 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, ExA
 
-MakeModel = Callable[..., KNNTD]
+Algorithm = type[KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
+
+
+@pytest.fixture(params=[KNNTD, ExA])
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    chosen: Algorithm = request.param
+    return chosen
 
 
 class Witness(BaseCallback):
@@ -111,7 +118,9 @@ def test_list_of_callbacks_stops_if_one_says_so(make_model: MakeModel) -> None:
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_evaluation(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, n_envs: int) -> None:
+def test_evaluation(
+    algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, n_envs: int
+) -> None:
     callback = EvalCallback(
         make_venv(n_envs),
         n_eval_episodes=6,
@@ -124,7 +133,7 @@ def test_evaluation(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathli
     results = np.load(tmp_path / "evaluations.npz")
     assert results["timesteps"].tolist() == [50 * n_envs, 100 * n_envs]
     assert results["results"].shape == (2, 6)
-    best = KNNTD.load(tmp_path / "best_model")
+    best = algorithm.load(tmp_path / "best_model")
     assert best.policy.q_table.shape == model.policy.q_table.shape
     assert callback.best_mean_reward == pytest.approx(results["results"].mean(axis=1).max())
 
@@ -150,11 +159,11 @@ def test_evaluation_beside_normalised_training(make_model: MakeModel, make_venv:
     assert np.isfinite(callback.last_mean_reward)
 
 
-def test_checkpoints(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+def test_checkpoints(algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
     callback = CheckpointCallback(save_freq=20, save_path=str(tmp_path), name_prefix="drift")
     make_model(make_venv(2)).learn(100, callback=callback)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["drift_40_steps.zip", "drift_80_steps.zip"]
-    assert KNNTD.load(tmp_path / "drift_40_steps").num_timesteps == 40
+    assert algorithm.load(tmp_path / "drift_40_steps").num_timesteps == 40
 
 
 def test_checkpoints_beside_those_of_normalisation(
@@ -212,7 +221,9 @@ def test_progress_bar(make_model: MakeModel, arguments: dict[str, Any], capfd: p
     assert "60/60" in "".join(capfd.readouterr())
 
 
-def test_error_in_a_callback_leaves_a_usable_model(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_error_in_a_callback_leaves_a_usable_model(
+    algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path
+) -> None:
     def fail(local: dict[str, Any], _: dict[str, Any]) -> bool:
         if local["self"].num_timesteps == 50:
             raise KeyboardInterrupt
@@ -222,7 +233,7 @@ def test_error_in_a_callback_leaves_a_usable_model(make_model: MakeModel, tmp_pa
     with pytest.raises(KeyboardInterrupt):
         model.learn(100, callback=fail)
     model.save(tmp_path / "model")
-    assert KNNTD.load(tmp_path / "model").num_timesteps == 50
+    assert algorithm.load(tmp_path / "model").num_timesteps == 50
     # The fifty first steps are not lost, and the next fifty follow on them.
     model.learn(50, reset_num_timesteps=False)
     assert model.num_timesteps == 100

@@ -12,20 +12,33 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, ExA
 
-MakeModel = Callable[..., KNNTD]
+Algorithm = type[KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
 
-SETTINGS: dict[str, dict[str, Any]] = {
-    "epsilon": {"exploration_initial_eps": 0.5, "exploration_fraction": 1.0},
-    "softmax": {"exploration": "softmax"},
-    "random ties": {"exploration_initial_eps": 0.0, "tie_break": "random"},
-}
+
+@pytest.fixture(params=[KNNTD, ExA])
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    chosen: Algorithm = request.param
+    return chosen
+
+
+EXPLORING: dict[str, Any] = {"exploration_initial_eps": 0.5, "exploration_fraction": 1.0}
+GREEDY: dict[str, Any] = {"exploration_initial_eps": 0.0, "tie_break": "random"}
+CHANCE = [
+    pytest.param(KNNTD, EXPLORING, id="KNNTD-epsilon"),
+    pytest.param(KNNTD, {"exploration": "softmax"}, id="KNNTD-softmax"),
+    pytest.param(KNNTD, GREEDY, id="KNNTD-random ties"),
+    pytest.param(ExA, EXPLORING, id="ExA-shared"),
+    pytest.param(ExA, {**EXPLORING, "exploration": "per_neighbor"}, id="ExA-per neighbor"),
+    pytest.param(ExA, GREEDY, id="ExA-random ties"),
+]
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+@pytest.mark.parametrize(("algorithm", "settings"), CHANCE)
 def test_seeds(make_model: MakeModel, make_venv: MakeVenv, settings: dict[str, Any], n_envs: int) -> None:
     # The environments know no chance: all that differs is what the model draws.
     first, second, other = (make_model(make_venv(n_envs), seed=seed, **settings).learn(150) for seed in (5, 5, 6))
@@ -34,11 +47,11 @@ def test_seeds(make_model: MakeModel, make_venv: MakeVenv, settings: dict[str, A
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_environments_are_seeded(n_envs: int) -> None:
+def test_environments_are_seeded(algorithm: Algorithm, mountain_car: str, n_envs: int) -> None:
     def learn(seed: int) -> th.Tensor:
-        venv = make_vec_env(lambda: gym.make("MountainCar-v0", max_episode_steps=25), n_envs)
+        venv = make_vec_env(lambda: gym.make(mountain_car, max_episode_steps=25), n_envs)
         # Nothing is drawn but the starts of the episodes.
-        model = KNNTD(venv, points=8, n_neighbors=4, exploration_initial_eps=0.0, tie_break="first", seed=seed)
+        model = algorithm(venv, points=8, n_neighbors=4, exploration_initial_eps=0.0, tie_break="first", seed=seed)
         return model.learn(120).policy.q_table
 
     assert th.equal(learn(1), learn(1))
@@ -70,10 +83,9 @@ def test_draws_do_not_hang_on_other_users_of_the_global_generators(make_model: M
 
 
 def test_set_random_seed_begins_the_sequence_anew(make_model: MakeModel) -> None:
-    settings = SETTINGS["epsilon"]
-    reseeded = make_model(seed=1, **settings)
+    reseeded = make_model(seed=1, **EXPLORING)
     reseeded.set_random_seed(5)
-    assert th.equal(reseeded.learn(150).policy.q_table, make_model(seed=5, **settings).learn(150).policy.q_table)
+    assert th.equal(reseeded.learn(150).policy.q_table, make_model(seed=5, **EXPLORING).learn(150).policy.q_table)
 
 
 def test_kind_of_vec_env_decides_nothing(make_model: MakeModel, make_venv: MakeVenv) -> None:

@@ -19,12 +19,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import NearestPoints, Rates
 from reference_exa import Choice, ReferenceExA, Transition
-from stable_baselines3.common.callbacks import EvalCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
-from toy_envs import DriftEnv, RecordingVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
+from toy_envs import DriftEnv, PushEnv, RecordingVecEnv
 
 import sb3_knntd.envs  # noqa: F401  registers the paper's environments
 from sb3_knntd import KNNTD, ExA
@@ -39,33 +37,6 @@ POINTS: dict[str, Any] = {"lattice": (8, 6), "scattered": SCATTERED}
 # No point is the mean of two others, so that an average is not mistaken for one of them.
 ONE = [[-1.0, -0.13, 0.71, 0.9]]
 TWO = [[-1.0, 0.37, 0.83], [0.11, 0.29]]
-
-
-class PushEnv(DriftEnv):
-    """The drifting point, pushed by all numbers of its action, each with a different effect."""
-
-    def __init__(
-        self,
-        shape: tuple[int, ...] = (1,),
-        low: Any = -1.0,
-        high: Any = 1.0,
-        dtype: Any = np.float64,
-        unbounded: bool = False,
-        **arguments: Any,
-    ) -> None:
-        super().__init__(**arguments)
-        self.action_space = spaces.Box(low, high, shape, dtype=dtype)  # type: ignore[assignment]
-        if unbounded:
-            self.observation_space = spaces.Box(-np.inf, np.inf, (2,), dtype=np.float32)
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        assert self.action_space.contains(action), action
-        pushes = np.asarray(action, dtype=np.float64).ravel() / np.arange(1, np.size(action) + 1)
-        self.v += 0.009 * pushes.sum() - 0.0061 * np.cos(3.0 * self.x)
-        self.x += self.v
-        reward = -1.0 + 0.6 * np.sin(4.0 * self.x) - 4.0 * abs(self.v) - 0.2 * np.sum((pushes - 0.4) ** 2)
-        terminated, truncated = self._end_of_step()
-        return self._observe(), float(reward), terminated, truncated, {}
 
 
 def make_venv(n_envs: int = 1, **arguments: Any) -> DummyVecEnv:
@@ -657,59 +628,7 @@ def test_files_of_the_other_algorithm_are_refused(tmp_path: pathlib.Path) -> Non
         assert f"holds a model of {holds}, not of {cls.__name__}" in message
 
 
-def test_parameters_can_be_read_and_set() -> None:
-    first, second = make_model().learn(60), make_model(seed=1)
-    second.set_parameters(first.get_parameters())
-    assert th.equal(first.policy.q_table, second.policy.q_table)
-
-
-@pytest.mark.parametrize("n_envs", [1, 4])
-@pytest.mark.parametrize("exploration", ["shared", "per_neighbor"])
-def test_seed_decides(n_envs: int, exploration: str) -> None:
-    def learned(seed: int) -> np.ndarray:
-        return table(make_model(make_venv(n_envs), exploration=exploration, seed=seed).learn(120))
-
-    np.testing.assert_array_equal(learned(3), learned(3))
-    assert not np.array_equal(learned(3), learned(4))
-
-
 # ------------------------------------------------------------------------------------- as SB3 has it
-
-
-@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
-def test_vec_envs(vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv]) -> None:
-    venv = make_vec_env("Pendulum-v1", 2 if vec_env_cls is SubprocVecEnv else 8, vec_env_cls=vec_env_cls)
-    try:
-        model = ExA(venv, points=5, seed=0).learn(800)
-        mean, _ = evaluate_policy(model, venv, 2, warn=False)
-    finally:
-        venv.close()
-    assert model.policy.q_table.any()
-    assert isinstance(mean, float)
-    assert -2000 < mean < 0
-
-
-def test_vec_normalize(tmp_path: pathlib.Path) -> None:
-    def make() -> VecEnv:
-        return VecNormalize(make_venv(2))
-
-    arguments: dict[str, Any] = {"bounds": ([-2.0, -2.0], [2.0, 2.0])}
-    whole = make_model(make(), **arguments).learn(100).learn(100, reset_num_timesteps=False)
-    venv = make()
-    make_model(venv, **arguments).learn(100).save(tmp_path / "middle")
-    resumed = ExA.load(tmp_path / "middle", env=venv, force_reset=False).learn(100, reset_num_timesteps=False)
-    assert th.equal(resumed.policy.q_table, whole.policy.q_table)
-
-
-def test_eval_callback(tmp_path: pathlib.Path) -> None:
-    callback = EvalCallback(
-        make_venv(), eval_freq=50, n_eval_episodes=3, best_model_save_path=str(tmp_path), verbose=0, warn=False
-    )
-    make_model().learn(150, callback=callback)
-    assert np.isfinite(callback.best_mean_reward)
-    best = ExA.load(tmp_path / "best_model", env=make_venv())
-    assert best.policy.q_table.any()
-    assert np.isfinite(evaluate_policy(best, make_venv(), 3, warn=False)[0])
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -738,12 +657,6 @@ def test_finite_observations() -> None:
     assert model.policy.q_table.shape == (4, 3)
     assert model.policy.q_table.any()
     assert model.action_space.contains(model.predict(np.array(2), deterministic=True)[0])
-
-
-def test_logged_under_its_own_name(tmp_path: pathlib.Path) -> None:
-    pytest.importorskip("tensorboard")
-    make_model(tensorboard_log=str(tmp_path)).learn(60)
-    assert (tmp_path / "ExA_1").is_dir()
 
 
 def test_the_papers_cart_pole() -> None:
@@ -823,16 +736,6 @@ def test_a_network_is_refused(policy: str) -> None:
     message = message_of(lambda: ExA(policy, PushEnv()))
     assert f"ExA has no {policy!r}" in message
     assert 'ExA("KNNPolicy", env)' in message
-
-
-def test_either_order_of_policy_and_environment() -> None:
-    assert isinstance(ExA("KNNPolicy", PushEnv(), points=3).policy, type(ExA(PushEnv(), points=3).policy))
-    assert ExA("Pendulum-v1", points=3).action_space.shape == (1,)
-
-
-def test_a_file_of_other_action_spaces_is_refused(tmp_path: pathlib.Path) -> None:
-    make_model().save(tmp_path / "one")
-    assert "ction spaces do not match" in message_of(lambda: ExA.load(tmp_path / "one", env=make_venv(shape=(2,))))
 
 
 # ------------------------------------------------------------------------------------------- learning

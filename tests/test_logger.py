@@ -14,11 +14,19 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 from toy_envs import DriftEnv
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, ExA
 
-MakeModel = Callable[..., KNNTD]
+Algorithm = type[KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
 ReadLog = Callable[[pathlib.Path], list[dict[str, float]]]
+
+
+@pytest.fixture(params=[KNNTD, ExA])
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    chosen: Algorithm = request.param
+    return chosen
+
 
 SB3_KEYS = {"rollout/ep_rew_mean", "rollout/ep_len_mean", "time/fps", "time/total_timesteps"}
 OWN_KEYS = {
@@ -32,7 +40,7 @@ OWN_KEYS = {
 TEXT_KEYS = {"time/episodes", "time/time_elapsed", "time/total_timesteps"}
 
 
-def logged(model: KNNTD, folder: pathlib.Path) -> KNNTD:
+def logged(model: KNNTD | ExA, folder: pathlib.Path) -> KNNTD | ExA:
     model.set_logger(configure(str(folder), ["csv"]))
     return model
 
@@ -90,17 +98,20 @@ def test_visited_points_are_those_that_were_learned_at(
     assert read_log(tmp_path)[-1]["train/visited_points"] == moved
 
 
+class SameEpisode(gym.Wrapper[Any, Any, Any, Any]):
+    """Every episode is the first."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.unwrapped.episode = -1  # type: ignore[attr-defined]
+        return super().reset(**kwargs)
+
+
 def test_means_are_of_the_steps_since_the_last_log(
-    make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
+    env_cls: type[DriftEnv], make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
 ) -> None:
     # A table that does not move has the same TD errors in the same episode, whatever came before it.
-    class SameEpisode(DriftEnv):
-        def reset(self, **kwargs: Any) -> Any:
-            self.episode = -1
-            return super().reset(**kwargs)
-
     model = make_model(
-        SameEpisode(), learning_rate=0.0, initial_value=-3.0, tie_break="first", exploration_initial_eps=0
+        SameEpisode(env_cls()), learning_rate=0.0, initial_value=-3.0, tie_break="first", exploration_initial_eps=0
     )
     logged(model, tmp_path).learn(36, log_interval=1)
     rows = read_log(tmp_path)
@@ -132,16 +143,18 @@ def test_means_are_over_the_window(make_model: MakeModel, read_log: ReadLog, tmp
 
 
 def test_environments_without_monitor_log_what_is_known(
-    make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
+    env_cls: type[DriftEnv], make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
 ) -> None:
-    logged(make_model(DummyVecEnv([DriftEnv])), tmp_path).learn(60)
+    logged(make_model(DummyVecEnv([env_cls])), tmp_path).learn(60)
     row = read_log(tmp_path)[-1]
     assert row.keys() >= OWN_KEYS
     assert "rollout/ep_rew_mean" not in row
 
 
-def test_vec_monitor_is_read(make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path) -> None:
-    logged(make_model(VecMonitor(DummyVecEnv([DriftEnv]))), tmp_path).learn(60)
+def test_vec_monitor_is_read(
+    env_cls: type[DriftEnv], make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
+) -> None:
+    logged(make_model(VecMonitor(DummyVecEnv([env_cls]))), tmp_path).learn(60)
     assert read_log(tmp_path)[0]["rollout/ep_len_mean"] == pytest.approx((9 + 14 + 6 + 9) / 4)
 
 
@@ -153,8 +166,10 @@ class WithSuccess(gym.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, {**info, "is_success": True}
 
 
-def test_success_rate(make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path) -> None:
-    logged(make_model(WithSuccess(DriftEnv())), tmp_path).learn(60)
+def test_success_rate(
+    env_cls: type[DriftEnv], make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
+) -> None:
+    logged(make_model(WithSuccess(env_cls())), tmp_path).learn(60)
     assert read_log(tmp_path)[-1]["rollout/success_rate"] == 1.0
 
 
@@ -166,8 +181,10 @@ def test_learning_on_goes_on_counting(make_model: MakeModel, read_log: ReadLog, 
     assert [row["time/episodes"] for row in rows] == [1, 2, 3, 4, 5, 6, 7]
 
 
-def test_steps_of_measuring_are_logged(read_log: ReadLog, tmp_path: pathlib.Path) -> None:
-    logged(KNNTD("CartPole-v1", points=3, n_neighbors=2, seed=0), tmp_path).learn(400)
+def test_steps_of_measuring_are_logged(
+    algorithm: Algorithm, cart_pole: str, read_log: ReadLog, tmp_path: pathlib.Path
+) -> None:
+    logged(algorithm(cart_pole, points=3, n_neighbors=2, seed=0), tmp_path).learn(400)
     rows = read_log(tmp_path)
     assert rows
     assert all(row.keys() >= SB3_KEYS for row in rows)
@@ -193,26 +210,32 @@ def read_tensorboard(folder: pathlib.Path) -> dict[str, list[int]]:
     return {tag: [event.step for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 
 
-def test_tensorboard_has_the_same_keys(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_tensorboard_has_the_same_keys(algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     make_model(tensorboard_log=str(tmp_path)).learn(85)
-    assert [folder.name for folder in tmp_path.iterdir()] == ["KNNTD_1"]
-    scalars = read_tensorboard(tmp_path / "KNNTD_1")
+    assert [folder.name for folder in tmp_path.iterdir()] == [f"{algorithm.__name__}_1"]
+    scalars = read_tensorboard(tmp_path / f"{algorithm.__name__}_1")
     expected = (SB3_KEYS | OWN_KEYS) - TEXT_KEYS
     assert scalars.keys() >= expected
     assert not scalars.keys() & TEXT_KEYS
     assert {tuple(scalars[key]) for key in expected} == {(38, 81)}
 
 
-def test_runs_are_numbered_by_name(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_runs_are_numbered_by_name(algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     model = make_model(tensorboard_log=str(tmp_path))
     model.learn(30)
     model.learn(30)
     model.learn(30, tb_log_name="drift")
-    assert sorted(folder.name for folder in tmp_path.iterdir()) == ["KNNTD_1", "KNNTD_2", "drift_1"]
+    assert sorted(folder.name for folder in tmp_path.iterdir()) == [
+        f"{algorithm.__name__}_1",
+        f"{algorithm.__name__}_2",
+        "drift_1",
+    ]
 
 
-def test_learning_on_writes_into_the_same_run(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_learning_on_writes_into_the_same_run(
+    algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path
+) -> None:
     model = make_model(tensorboard_log=str(tmp_path)).learn(40)
     model.learn(60, reset_num_timesteps=False)
-    assert [folder.name for folder in tmp_path.iterdir()] == ["KNNTD_1"]
-    assert read_tensorboard(tmp_path / "KNNTD_1")["train/td_error"] == [38, 81]
+    assert [folder.name for folder in tmp_path.iterdir()] == [f"{algorithm.__name__}_1"]
+    assert read_tensorboard(tmp_path / f"{algorithm.__name__}_1")["train/td_error"] == [38, 81]

@@ -14,45 +14,59 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 from toy_envs import DriftEnv, GridEnv
 
-from sb3_knntd import KNNTD, Perception
+from sb3_knntd import KNNTD, ExA, Perception
 
-MakeModel = Callable[..., KNNTD]
+Algorithm = type[KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA]
+
+# What only an algorithm of Discrete actions has.
+KNNTD_ONLY = pytest.mark.parametrize("algorithm", [KNNTD])
+
+
+@pytest.fixture(params=[KNNTD, ExA])
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    chosen: Algorithm = request.param
+    return chosen
 
 
 @pytest.fixture
-def model(make_model: MakeModel) -> KNNTD:
+def model(make_model: MakeModel) -> KNNTD | ExA:
     return make_model().learn(200)
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
-def test_single_observation_gives_single_action(model: KNNTD, deterministic: bool) -> None:
+def test_single_observation_gives_single_action(model: KNNTD | ExA, deterministic: bool) -> None:
     observation, _ = DriftEnv().reset()
     action, state = model.predict(observation, deterministic=deterministic)
-    assert np.shape(action) == ()
+    assert np.shape(action) == model.action_space.shape
     assert model.action_space.contains(action)
     assert state is None
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("batch", [1, 7, 100])
-def test_batch_gives_one_action_a_row(model: KNNTD, observations: np.ndarray, batch: int, deterministic: bool) -> None:
+def test_batch_gives_one_action_a_row(
+    model: KNNTD | ExA, observations: np.ndarray, batch: int, deterministic: bool
+) -> None:
     actions, _ = model.predict(observations[:batch], deterministic=deterministic)
-    assert actions.shape == (batch,)
+    assert actions.shape == (batch, *(model.action_space.shape or ()))
     assert all(model.action_space.contains(action) for action in actions)
 
 
-def test_batch_agrees_with_single(model: KNNTD, observations: np.ndarray) -> None:
+def test_batch_agrees_with_single(model: KNNTD | ExA, observations: np.ndarray) -> None:
     together, _ = model.predict(observations, deterministic=True)
-    alone = [int(model.predict(observation, deterministic=True)[0]) for observation in observations]
-    assert together.tolist() == alone
-    assert len(set(alone)) > 1, "a constant policy would make this test empty"
+    alone = [model.predict(observation, deterministic=True)[0] for observation in observations]
+    np.testing.assert_array_equal(together, alone)
+    assert len(np.unique(alone)) > 1, "a constant policy would make this test empty"
 
 
-def test_deterministic_action_is_the_best_by_q_values(model: KNNTD, observations: np.ndarray) -> None:
+@KNNTD_ONLY
+def test_deterministic_action_is_the_best_by_q_values(model: KNNTD | ExA, observations: np.ndarray) -> None:
     actions, _ = model.predict(observations, deterministic=True)
     assert actions.tolist() == model.policy.q_values(observations).argmax(dim=1).tolist()
 
 
+@KNNTD_ONLY
 def test_deterministic_prediction_breaks_ties_to_the_lowest_index(
     make_model: MakeModel, observations: np.ndarray
 ) -> None:
@@ -61,7 +75,9 @@ def test_deterministic_prediction_breaks_ties_to_the_lowest_index(
     assert not actions.any()
 
 
-def test_prediction_leaves_the_model_as_it_is(model: KNNTD, make_model: MakeModel, observations: np.ndarray) -> None:
+def test_prediction_leaves_the_model_as_it_is(
+    model: KNNTD | ExA, make_model: MakeModel, observations: np.ndarray
+) -> None:
     model.predict(observations)
     model.predict(observations[0], deterministic=True)
     model.policy.q_values(observations)
@@ -70,7 +86,7 @@ def test_prediction_leaves_the_model_as_it_is(model: KNNTD, make_model: MakeMode
     assert th.equal(model.policy.q_table, unasked.policy.q_table)
 
 
-def test_q_values_are_the_weighted_rows_of_the_table(model: KNNTD, observations: np.ndarray) -> None:
+def test_q_values_are_the_weighted_rows_of_the_table(model: KNNTD | ExA, observations: np.ndarray) -> None:
     perception = model.policy.perceive(observations)
     assert isinstance(perception, Perception)
     assert perception.indices.shape == perception.probabilities.shape == (len(observations), 4)
@@ -80,7 +96,7 @@ def test_q_values_are_the_weighted_rows_of_the_table(model: KNNTD, observations:
     th.testing.assert_close(model.policy.q_values(observations), values)
 
 
-def test_perceived_points_are_the_nearest(model: KNNTD, observations: np.ndarray) -> None:
+def test_perceived_points_are_the_nearest(model: KNNTD | ExA, observations: np.ndarray) -> None:
     points = model.policy.points.numpy()
     assert points.shape == (48, 2)
     width = DriftEnv.HIGH - DriftEnv.LOW
@@ -89,12 +105,12 @@ def test_perceived_points_are_the_nearest(model: KNNTD, observations: np.ndarray
     np.testing.assert_allclose(chosen, np.sort(distances, axis=1)[:, :4], rtol=1e-9)
 
 
-def test_single_observation_is_perceived_as_one_row(model: KNNTD, observations: np.ndarray) -> None:
+def test_single_observation_is_perceived_as_one_row(model: KNNTD | ExA, observations: np.ndarray) -> None:
     assert model.policy.perceive(observations[0]).indices.shape == (1, 4)
     assert model.policy.q_values(observations[0]).shape == (1, 3)
 
 
-def test_tensors_are_perceived_as_arrays_are(model: KNNTD, observations: np.ndarray) -> None:
+def test_tensors_are_perceived_as_arrays_are(model: KNNTD | ExA, observations: np.ndarray) -> None:
     assert th.equal(model.policy.q_values(th.from_numpy(observations)), model.policy.q_values(observations))
 
 
@@ -128,6 +144,7 @@ class ShiftedActions(gym.ActionWrapper[Any, Any, Any]):
         return action - self.first
 
 
+@KNNTD_ONLY
 @pytest.mark.parametrize("first", [-1, 5])
 def test_actions_may_start_anywhere(make_model: MakeModel, observations: np.ndarray, first: int) -> None:
     shifted = make_model(ShiftedActions(DriftEnv(), first), exploration_initial_eps=0.5).learn(200)
@@ -138,19 +155,19 @@ def test_actions_may_start_anywhere(make_model: MakeModel, observations: np.ndar
 
 
 @pytest.mark.parametrize("wrong", [np.zeros(3, np.float32), np.zeros((4, 3), np.float32), np.float32(0.0)])
-def test_observation_of_another_shape_is_refused(model: KNNTD, wrong: np.ndarray) -> None:
+def test_observation_of_another_shape_is_refused(model: KNNTD | ExA, wrong: np.ndarray) -> None:
     with pytest.raises(ValueError, match="shape"):
         model.predict(wrong)
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
-def test_observation_that_is_not_finite_is_refused(model: KNNTD, wrong: float) -> None:
+def test_observation_that_is_not_finite_is_refused(model: KNNTD | ExA, wrong: float) -> None:
     with pytest.raises(ValueError, match="finite"):
         model.predict(np.array([0.0, wrong], dtype=np.float32))
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_evaluate_policy(model: KNNTD, make_venv: Callable[..., VecEnv], n_envs: int) -> None:
+def test_evaluate_policy(model: KNNTD | ExA, make_venv: Callable[..., VecEnv], n_envs: int) -> None:
     returns, lengths = evaluate_policy(
         model, make_venv(n_envs), n_eval_episodes=9, return_episode_rewards=True, deterministic=True
     )
@@ -165,4 +182,4 @@ def test_tables_may_have_half_the_size(make_model: MakeModel, observations: np.n
     full = make_model().learn(100)
     assert full.policy.q_table.dtype == th.float64
     assert half.policy.q_table.dtype == half.policy.q_values(observations).dtype == th.float32
-    assert half.predict(observations)[0].shape == (100,)
+    assert half.predict(observations)[0].shape == full.predict(observations)[0].shape

@@ -23,46 +23,75 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from toy_envs import DriftEnv, GridEnv
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, ExA
 
-MakeModel = Callable[..., KNNTD]
+Algorithm = type[KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
+
+
+@pytest.fixture(params=[KNNTD, ExA])
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    chosen: Algorithm = request.param
+    return chosen
+
 
 SCATTERED = np.random.default_rng(5).uniform(DriftEnv.LOW, DriftEnv.HIGH, size=(30, 2))
 # Each makes a model differ from the others in what has to be kept.
 SETTINGS: dict[str, dict[str, Any]] = {
     "defaults": {},
     "constant epsilon": {"exploration_initial_eps": 0.4, "exploration_final_eps": 0.4},
-    "softmax": {"exploration": "softmax", "temperature": LinearSchedule(1.0, 0.2, 1.0)},
     "schedules": {"learning_rate": LinearSchedule(0.8, 0.1, 1.0), "trace_decay": LinearSchedule(0.3, 0.9, 1.0)},
     "accumulating": {"traces": "accumulating", "step_size": "paper", "trace_decay": 0.8, "learning_rate": 0.1},
     "greedy, random ties": {"exploration_initial_eps": 0.0, "tie_break": "random"},
     "first ties": {"exploration_initial_eps": 0.1, "tie_break": "first"},
-    "q_learning": {"target": "q_learning", "exploration_initial_eps": 0.3},
-    "expected_sarsa": {"target": "expected_sarsa", "exploration_initial_eps": 0.3},
     "scattered": {"points": SCATTERED},
     "half size": {"policy_kwargs": {"dtype": th.float32}},
     "own weights": {"weights": lambda d2: (1.0 + d2) ** -2},
     "no seed": {"seed": None},
 }
+KNNTD_SETTINGS: dict[str, dict[str, Any]] = {
+    "softmax": {"exploration": "softmax", "temperature": LinearSchedule(1.0, 0.2, 1.0)},
+    "q_learning": {"target": "q_learning", "exploration_initial_eps": 0.3},
+    "expected_sarsa": {"target": "expected_sarsa", "exploration_initial_eps": 0.3},
+}
+EXA_SETTINGS: dict[str, dict[str, Any]] = {
+    "long hold": {"exploration_hold": 1e6, "exploration_initial_eps": 0.7, "exploration_final_eps": 0.7},
+    "automatic hold": {"exploration_hold": "auto", "exploration_initial_eps": 0.7},
+    "per neighbor": {"exploration": "per_neighbor", "exploration_initial_eps": 0.3},
+    "other action points": {"action_points": [[-1.0, -0.13, 0.71, 0.9]]},
+}
+MODELS = pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [
+        pytest.param(algorithm, settings, id=f"{algorithm.__name__}-{name}")
+        for algorithm, own in ((KNNTD, KNNTD_SETTINGS), (ExA, EXA_SETTINGS))
+        for name, settings in {**SETTINGS, **own}.items()
+    ],
+)
 
 
-def same_table(first: KNNTD, second: KNNTD) -> bool:
+def same_table(first: KNNTD | ExA, second: KNNTD | ExA) -> bool:
     return th.equal(first.policy.q_table, second.policy.q_table)
 
 
-def go_on(path: pathlib.Path, venv: VecEnv, n_steps: int) -> KNNTD:
+def go_on(algorithm: Algorithm, path: pathlib.Path, venv: VecEnv, n_steps: int) -> KNNTD | ExA:
     """Load, and learn on from where it was in an environment that is still in the state it was in."""
-    return KNNTD.load(path, env=venv, force_reset=False).learn(n_steps, reset_num_timesteps=False)
+    return algorithm.load(path, env=venv, force_reset=False).learn(n_steps, reset_num_timesteps=False)
 
 
 # ------------------------------------------------------------ what is kept
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+@MODELS
 def test_interrupted_run_equals_the_uninterrupted(
-    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, settings: dict[str, Any], n_envs: int
+    algorithm: Algorithm,
+    make_model: MakeModel,
+    make_venv: MakeVenv,
+    tmp_path: pathlib.Path,
+    settings: dict[str, Any],
+    n_envs: int,
 ) -> None:
     # Odd numbers, so that episodes are under way in all environments.
     whole = make_model(make_venv(n_envs), **settings)
@@ -71,8 +100,8 @@ def test_interrupted_run_equals_the_uninterrupted(
 
     venv = make_venv(n_envs)
     # Both begin with the same random state also where no seed was given.
-    KNNTD.load(tmp_path / "start", env=venv).learn(101).save(tmp_path / "middle")
-    resumed = go_on(tmp_path / "middle", venv, 101)
+    algorithm.load(tmp_path / "start", env=venv).learn(101).save(tmp_path / "middle")
+    resumed = go_on(algorithm, tmp_path / "middle", venv, 101)
     assert same_table(resumed, whole)
     assert resumed.num_timesteps == whole.num_timesteps
     assert resumed.exploration_rate == whole.exploration_rate
@@ -80,41 +109,51 @@ def test_interrupted_run_equals_the_uninterrupted(
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-@pytest.mark.parametrize("env_id", ["MountainCar-v0", "FrozenLake-v1"])
-def test_interrupted_run_in_environments_with_chance(tmp_path: pathlib.Path, env_id: str, n_envs: int) -> None:
+@pytest.mark.parametrize(
+    ("algorithm", "env_id", "arguments"),
+    [
+        (KNNTD, "MountainCar-v0", {"points": (6, 6), "n_neighbors": 4}),
+        (KNNTD, "FrozenLake-v1", {}),
+        (ExA, "MountainCarContinuous-v0", {"points": (6, 6), "n_neighbors": 4}),
+    ],
+)
+def test_interrupted_run_in_environments_with_chance(
+    algorithm: Algorithm, tmp_path: pathlib.Path, env_id: str, arguments: dict[str, Any], n_envs: int
+) -> None:
     def make() -> VecEnv:
         return make_vec_env(lambda: gym.make(env_id, max_episode_steps=30), n_envs)
 
-    arguments: dict[str, Any] = {"points": (6, 6), "n_neighbors": 4} if env_id == "MountainCar-v0" else {}
-    whole = KNNTD(make(), seed=3, **arguments).learn(110).learn(110, reset_num_timesteps=False)
+    whole = algorithm(make(), seed=3, **arguments).learn(110).learn(110, reset_num_timesteps=False)
     venv = make()
-    KNNTD(venv, seed=3, **arguments).learn(110).save(tmp_path / "middle")
-    assert same_table(go_on(tmp_path / "middle", venv, 110), whole)
+    algorithm(venv, seed=3, **arguments).learn(110).save(tmp_path / "middle")
+    assert same_table(go_on(algorithm, tmp_path / "middle", venv, 110), whole)
 
 
 @pytest.mark.parametrize("first", [300, 1200])
-def test_interrupted_while_and_after_measuring(tmp_path: pathlib.Path, first: int) -> None:
+def test_interrupted_while_and_after_measuring(
+    algorithm: Algorithm, cart_pole: str, tmp_path: pathlib.Path, first: int
+) -> None:
     def make() -> VecEnv:
-        return make_vec_env("CartPole-v1", 1)
+        return make_vec_env(cart_pole, 1)
 
     arguments: dict[str, Any] = {"points": 3, "n_neighbors": 4, "seed": 1}
-    whole = KNNTD(make(), **arguments).learn(first).learn(1400 - first, reset_num_timesteps=False)
+    whole = algorithm(make(), **arguments).learn(first).learn(1400 - first, reset_num_timesteps=False)
     venv = make()
-    KNNTD(venv, **arguments).learn(first).save(tmp_path / "middle")
-    resumed = go_on(tmp_path / "middle", venv, 1400 - first)
+    algorithm(venv, **arguments).learn(first).save(tmp_path / "middle")
+    resumed = go_on(algorithm, tmp_path / "middle", venv, 1400 - first)
     assert same_table(resumed, whole)
     assert resumed.policy.q_table.any()
     assert th.equal(resumed.policy.points, whole.policy.points)
 
 
 def test_interrupted_run_in_normalised_environments(
-    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
+    algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
 ) -> None:
     bounds = ([-2.0, -2.0], [2.0, 2.0])
     whole = make_model(VecNormalize(make_venv(2)), bounds=bounds).learn(100).learn(100, reset_num_timesteps=False)
     venv = VecNormalize(make_venv(2))
     make_model(venv, bounds=bounds).learn(100).save(tmp_path / "middle")
-    resumed = go_on(tmp_path / "middle", venv, 100)
+    resumed = go_on(algorithm, tmp_path / "middle", venv, 100)
     assert same_table(resumed, whole)
 
 
@@ -144,7 +183,13 @@ class Snapshot(BaseCallback):
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize("learning_rate", [0.3, LinearSchedule(0.9, 0.0, 1.0), lambda progress: 0.5 * progress**2])
 def test_checkpoint_in_the_middle_of_learn(
-    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, learning_rate: Any, n_envs: int, at: int
+    algorithm: Algorithm,
+    make_model: MakeModel,
+    make_venv: MakeVenv,
+    tmp_path: pathlib.Path,
+    learning_rate: Any,
+    n_envs: int,
+    at: int,
 ) -> None:
     arguments = {"learning_rate": learning_rate, "exploration_fraction": 1.0, "exploration_initial_eps": 0.5}
     total = 240 * n_envs
@@ -153,16 +198,21 @@ def test_checkpoint_in_the_middle_of_learn(
     whole = make_model(make_venv(n_envs), **arguments).learn(total, callback=CallbackList([checkpoints, snapshot]))
 
     done = at * n_envs
-    resumed = go_on(tmp_path / f"rl_model_{done}_steps", snapshot.venv, total - done)
+    resumed = go_on(algorithm, tmp_path / f"rl_model_{done}_steps", snapshot.venv, total - done)
     assert resumed.num_timesteps == whole.num_timesteps == total
     assert same_table(resumed, whole)
     # It is not equal for want of anything to learn after the checkpoint.
-    assert not same_table(whole, KNNTD.load(tmp_path / f"rl_model_{done}_steps"))
+    assert not same_table(whole, algorithm.load(tmp_path / f"rl_model_{done}_steps"))
 
 
 @pytest.mark.parametrize("at", [29, 100])
 def test_checkpoint_keeps_the_counters_of_the_log(
-    make_model: MakeModel, make_venv: MakeVenv, read_log: Callable[..., Any], tmp_path: pathlib.Path, at: int
+    algorithm: Algorithm,
+    make_model: MakeModel,
+    make_venv: MakeVenv,
+    read_log: Callable[..., Any],
+    tmp_path: pathlib.Path,
+    at: int,
 ) -> None:
     def last_row(name: str) -> dict[str, float]:
         row = read_log(tmp_path / name)[-1]
@@ -174,19 +224,23 @@ def test_checkpoint_keeps_the_counters_of_the_log(
     checkpoints = CheckpointCallback(save_freq=at, save_path=str(tmp_path))
     whole.learn(160, callback=[checkpoints, snapshot], log_interval=1)
 
-    resumed = KNNTD.load(tmp_path / f"rl_model_{at}_steps", env=snapshot.venv, force_reset=False)
+    resumed = algorithm.load(tmp_path / f"rl_model_{at}_steps", env=snapshot.venv, force_reset=False)
     resumed.set_logger(configure(str(tmp_path / "resumed"), ["csv"]))
     resumed.learn(160 - at, reset_num_timesteps=False, log_interval=1)
     assert last_row("resumed") == last_row("whole")
 
 
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+@MODELS
 def test_loaded_model_predicts_the_same(
-    make_model: MakeModel, observations: np.ndarray, tmp_path: pathlib.Path, settings: dict[str, Any]
+    algorithm: Algorithm,
+    make_model: MakeModel,
+    observations: np.ndarray,
+    tmp_path: pathlib.Path,
+    settings: dict[str, Any],
 ) -> None:
     model = make_model(**settings).learn(150)
     model.save(tmp_path / "model")
-    loaded = KNNTD.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     assert same_table(loaded, model)
     assert loaded.policy.q_table.dtype == model.policy.q_table.dtype
     assert th.equal(loaded.policy.points, model.policy.points)
@@ -198,12 +252,14 @@ def test_loaded_model_predicts_the_same(
     )
 
 
-def test_measured_ranges_are_kept_without_the_environment(make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+def test_measured_ranges_are_kept_without_the_environment(
+    algorithm: Algorithm, make_venv: MakeVenv, tmp_path: pathlib.Path
+) -> None:
     # Nothing but the file knows of the normalisation that the ranges were measured under.
     venv = VecNormalize(make_venv(2))
-    model = KNNTD(venv, points=5, seed=0).learn(1200)
+    model = algorithm(venv, points=5, seed=0).learn(1200)
     model.save(tmp_path / "model")
-    loaded = KNNTD.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     seen = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
     assert th.equal(loaded.policy.points, model.policy.points)
     assert th.equal(loaded.policy.q_values(seen), model.policy.q_values(seen))
@@ -220,16 +276,25 @@ def test_exact_tables_are_kept(tmp_path: pathlib.Path, kind: str) -> None:
     assert np.array_equal(loaded.predict(states, deterministic=True)[0], model.predict(states, deterministic=True)[0])
 
 
-def test_arguments_are_kept(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+OWN_ARGUMENTS: dict[Algorithm, dict[str, Any]] = {
+    KNNTD: {"target": "q_learning", "exploration": "softmax", "temperature": 0.5},
+    ExA: {
+        "action_points": [[-1.0, 0.2, 1.0]], "action_table": "factored", "exploration": "per_neighbor",
+        "exploration_hold": 3.0,
+    },
+}  # fmt: skip
+
+
+def test_arguments_are_kept(algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     given = {
         "learning_rate": 0.2, "gamma": 0.9, "trace_decay": 0.7, "n_neighbors": 3, "points": [5, 4], "bandwidth": 0.5,
         "weights": "gaussian", "search": "brute", "step_size": "paper", "traces": "accumulating",
-        "reset_other_actions": False, "target": "q_learning", "exploration": "softmax", "temperature": 0.5,
-        "exploration_initial_eps": 0.3, "exploration_final_eps": 0.2, "exploration_fraction": 0.9,
-        "tie_break": "first", "initial_value": 2.0, "verbose": 0, "seed": 7,
+        "reset_other_actions": False, "exploration_initial_eps": 0.3, "exploration_final_eps": 0.2,
+        "exploration_fraction": 0.9, "tie_break": "first", "initial_value": 2.0, "verbose": 0, "seed": 7,
+        **OWN_ARGUMENTS[algorithm],
     }  # fmt: skip
     make_model(**given).save(tmp_path / "model")
-    loaded = KNNTD.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     assert {name: getattr(loaded, name) for name in given} == given
     assert (loaded.policy.q_table == 2.0).all()
 
@@ -239,11 +304,16 @@ def test_arguments_are_kept(make_model: MakeModel, tmp_path: pathlib.Path) -> No
 
 @pytest.mark.parametrize(("saved", "loaded"), [(1, 3), (3, 1), (2, 4)])
 def test_other_number_of_environments(
-    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, saved: int, loaded: int
+    algorithm: Algorithm,
+    make_model: MakeModel,
+    make_venv: MakeVenv,
+    tmp_path: pathlib.Path,
+    saved: int,
+    loaded: int,
 ) -> None:
     model = make_model(make_venv(saved)).learn(100)
     model.save(tmp_path / "model")
-    other = KNNTD.load(tmp_path / "model", env=make_venv(loaded))
+    other = algorithm.load(tmp_path / "model", env=make_venv(loaded))
     assert same_table(other, model)
     assert other.n_envs == loaded
     other.learn(90, reset_num_timesteps=False)
@@ -253,23 +323,27 @@ def test_other_number_of_environments(
 
 
 def test_other_number_of_environments_cannot_be_in_the_same_state(
-    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
+    algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
 ) -> None:
     make_model(make_venv(1)).learn(100).save(tmp_path / "model")
     # There is no state to go on from in three environments, and a load is all it takes to go on in others: so
     # new episodes begin, as if a reset had been asked for.
-    model = KNNTD.load(tmp_path / "model", env=make_venv(3), force_reset=False)
+    model = algorithm.load(tmp_path / "model", env=make_venv(3), force_reset=False)
     model.learn(90, reset_num_timesteps=False)
     assert model.num_timesteps == 190
     assert th.isfinite(model.policy.q_table).all()
 
 
 def test_load_without_environment_then_set_one(
-    make_model: MakeModel, make_venv: MakeVenv, observations: np.ndarray, tmp_path: pathlib.Path
+    algorithm: Algorithm,
+    make_model: MakeModel,
+    make_venv: MakeVenv,
+    observations: np.ndarray,
+    tmp_path: pathlib.Path,
 ) -> None:
     model = make_model().learn(100)
     model.save(tmp_path / "model")
-    loaded = KNNTD.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     assert loaded.get_env() is None
     assert np.array_equal(loaded.predict(observations)[0], model.predict(observations)[0])
     with pytest.raises(ValueError, match="set_env"):
@@ -280,44 +354,55 @@ def test_load_without_environment_then_set_one(
     assert not same_table(loaded, model)
 
 
-def test_reset_on_load_starts_new_episodes(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+def test_reset_on_load_starts_new_episodes(
+    algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
+) -> None:
     venv = make_venv()
     # The first episode has 9 steps, and 14 the second.
     make_model(venv).learn(4).save(tmp_path / "model")
-    resumed = KNNTD.load(tmp_path / "model", env=venv)
+    resumed = algorithm.load(tmp_path / "model", env=venv)
     resumed.learn(14, reset_num_timesteps=False)
     assert [info["l"] for info in resumed.ep_info_buffer or ()] == [14]
 
 
 @pytest.mark.parametrize("as_text", [True, False])
 @pytest.mark.parametrize(("name", "written"), [("mc", "mc.zip"), ("mc.zip", "mc.zip"), ("sub/folder/mc", None)])
-def test_paths(make_model: MakeModel, tmp_path: pathlib.Path, name: str, written: str | None, as_text: bool) -> None:
+def test_paths(
+    algorithm: Algorithm,
+    make_model: MakeModel,
+    tmp_path: pathlib.Path,
+    name: str,
+    written: str | None,
+    as_text: bool,
+) -> None:
     path: Any = str(tmp_path / name) if as_text else tmp_path / name
     model = make_model().learn(20)
     model.save(path)
     assert (tmp_path / (written or f"{name}.zip")).is_file()
-    assert same_table(KNNTD.load(path), model)
+    assert same_table(algorithm.load(path), model)
 
 
-def test_file_objects(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_file_objects(algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     model = make_model().learn(20)
     memory = io.BytesIO()
     model.save(memory)
     memory.seek(0)
-    assert same_table(KNNTD.load(memory), model)
+    assert same_table(algorithm.load(memory), model)
     with open(tmp_path / "model.zip", "wb") as file:
         model.save(file)
     with open(tmp_path / "model.zip", "rb") as file:
-        assert same_table(KNNTD.load(file), model)
+        assert same_table(algorithm.load(file), model)
 
 
-def test_attributes_are_changed_on_load(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+def test_attributes_are_changed_on_load(
+    algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
+) -> None:
     make_model().learn(20).save(tmp_path / "model")
-    model = KNNTD.load(tmp_path / "model", env=make_venv(), learning_rate=0.0, verbose=0)
+    model = algorithm.load(tmp_path / "model", env=make_venv(), learning_rate=0.0, verbose=0)
     before = model.policy.q_table.clone()
     model.learn(50)
     assert th.equal(model.policy.q_table, before)
-    replaced = KNNTD.load(tmp_path / "model", custom_objects={"gamma": 0.5}, print_system_info=True)
+    replaced = algorithm.load(tmp_path / "model", custom_objects={"gamma": 0.5}, print_system_info=True)
     assert replaced.gamma == 0.5
 
 
@@ -345,10 +430,10 @@ def saved(make_model: MakeModel, tmp_path: pathlib.Path) -> pathlib.Path:
     return path
 
 
-def check_untouched(path: pathlib.Path, before: bytes) -> None:
+def check_untouched(algorithm: Algorithm, path: pathlib.Path, before: bytes) -> None:
     assert [file.name for file in path.parent.iterdir()] == [path.name], "something was left behind"
     assert path.read_bytes() == before
-    assert KNNTD.load(path).num_timesteps == 100
+    assert algorithm.load(path).num_timesteps == 100
 
 
 @pytest.mark.parametrize(
@@ -357,24 +442,26 @@ def check_untouched(path: pathlib.Path, before: bytes) -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_interrupted_save_leaves_the_previous_file(
-    saved: pathlib.Path, monkeypatch: pytest.MonkeyPatch, module: Any, function: str
+    algorithm: Algorithm, saved: pathlib.Path, monkeypatch: pytest.MonkeyPatch, module: Any, function: str
 ) -> None:
     before = saved.read_bytes()
-    model = KNNTD.load(saved, learning_rate=0.7)
+    model = algorithm.load(saved, learning_rate=0.7)
     with monkeypatch.context() as patched:
         patched.setattr(module, function, interrupt)
         with pytest.raises(KeyboardInterrupt):
             model.save(saved)
-    check_untouched(saved, before)
+    check_untouched(algorithm, saved, before)
     # And the next one succeeds.
     model.save(saved)
-    assert KNNTD.load(saved).learning_rate == 0.7
+    assert algorithm.load(saved).learning_rate == 0.7
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
-def test_disk_that_is_full_at_some_byte_leaves_the_previous_file(saved: pathlib.Path, share: float) -> None:
+def test_disk_that_is_full_at_some_byte_leaves_the_previous_file(
+    algorithm: Algorithm, saved: pathlib.Path, share: float
+) -> None:
     before = saved.read_bytes()
-    model = KNNTD.load(saved, learning_rate=0.7)
+    model = algorithm.load(saved, learning_rate=0.7)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * len(before)), hard))
     try:
@@ -382,7 +469,7 @@ def test_disk_that_is_full_at_some_byte_leaves_the_previous_file(saved: pathlib.
             model.save(saved)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    check_untouched(saved, before)
+    check_untouched(algorithm, saved, before)
 
 
 def test_first_save_interrupted_leaves_nothing(
@@ -398,53 +485,53 @@ def test_first_save_interrupted_leaves_nothing(
 # ------------------------------------------------------------------ refusal
 
 
-def test_missing_file(tmp_path: pathlib.Path) -> None:
+def test_missing_file(algorithm: Algorithm, tmp_path: pathlib.Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        KNNTD.load(tmp_path / "nowhere")
+        algorithm.load(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99])
-def test_cut_off_file(saved: pathlib.Path, share: float) -> None:
+def test_cut_off_file(algorithm: Algorithm, saved: pathlib.Path, share: float) -> None:
     whole = saved.read_bytes()
     saved.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(ValueError, match=r"model\.zip"):
-        KNNTD.load(saved)
+        algorithm.load(saved)
 
 
-def test_file_without_its_last_byte(saved: pathlib.Path) -> None:
+def test_file_without_its_last_byte(algorithm: Algorithm, saved: pathlib.Path) -> None:
     saved.write_bytes(saved.read_bytes()[:-1])
     with pytest.raises(ValueError, match=r"model\.zip"):
-        KNNTD.load(saved)
+        algorithm.load(saved)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.7])
-def test_file_with_a_changed_byte(saved: pathlib.Path, share: float) -> None:
+def test_file_with_a_changed_byte(algorithm: Algorithm, saved: pathlib.Path, share: float) -> None:
     content = bytearray(saved.read_bytes())
     content[int(share * len(content))] ^= 0xFF
     saved.write_bytes(content)
     with pytest.raises(ValueError, match=r"model\.zip"):
-        KNNTD.load(saved)
+        algorithm.load(saved)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04", b"\x80\x04\x95"])
-def test_something_else_than_a_zip(tmp_path: pathlib.Path, content: bytes) -> None:
+def test_something_else_than_a_zip(algorithm: Algorithm, tmp_path: pathlib.Path, content: bytes) -> None:
     (tmp_path / "model.zip").write_bytes(content)
     with pytest.raises(ValueError, match=r"model\.zip"):
-        KNNTD.load(tmp_path / "model.zip")
+        algorithm.load(tmp_path / "model.zip")
 
 
 @pytest.mark.parametrize("data", [None, b"", b"{", b"[1, 2]", b"\xff\xfe"])
-def test_zip_of_something_else(tmp_path: pathlib.Path, data: bytes | None) -> None:
+def test_zip_of_something_else(algorithm: Algorithm, tmp_path: pathlib.Path, data: bytes | None) -> None:
     with zipfile.ZipFile(tmp_path / "model.zip", "w") as archive:
         archive.writestr("readme.txt", "holiday pictures")
         if data is not None:
             archive.writestr("data", data)
     with pytest.raises(ValueError, match=r"model\.zip"):
-        KNNTD.load(tmp_path / "model.zip")
+        algorithm.load(tmp_path / "model.zip")
 
 
 @pytest.mark.parametrize("missing", [".pth", "data"])
-def test_zip_without_one_of_its_parts(saved: pathlib.Path, missing: str) -> None:
+def test_zip_without_one_of_its_parts(algorithm: Algorithm, saved: pathlib.Path, missing: str) -> None:
     with zipfile.ZipFile(saved) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     # SB3 writes, and does not need, an empty file of variables.
@@ -455,41 +542,49 @@ def test_zip_without_one_of_its_parts(saved: pathlib.Path, missing: str) -> None
             for name in parts.keys() - {absent}:
                 archive.writestr(name, parts[name])
         with pytest.raises(ValueError, match=r"model\.zip"):
-            KNNTD.load(saved)
+            algorithm.load(saved)
 
 
-def test_file_of_another_algorithm(tmp_path: pathlib.Path) -> None:
+def test_file_of_another_algorithm(algorithm: Algorithm, tmp_path: pathlib.Path) -> None:
     DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "dqn")
-    with pytest.raises(ValueError, match="KNNTD"):
-        KNNTD.load(tmp_path / "dqn")
+    with pytest.raises(ValueError, match=algorithm.__name__):
+        algorithm.load(tmp_path / "dqn")
 
 
-def test_file_of_another_algorithm_is_not_unpickled(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_of_another_algorithm_is_not_unpickled(
+    algorithm: Algorithm, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "dqn")
     monkeypatch.setattr("stable_baselines3.common.save_util.json_to_data", interrupt)
-    with pytest.raises(ValueError, match="KNNTD"):
-        KNNTD.load(tmp_path / "dqn")
+    with pytest.raises(ValueError, match=algorithm.__name__):
+        algorithm.load(tmp_path / "dqn")
 
 
 @pytest.mark.parametrize("env", ["MountainCar-v0", "Acrobot-v1", GridEnv()], ids=["Box", "larger Box", "Discrete"])
-def test_file_of_another_space(saved: pathlib.Path, env: Any) -> None:
+def test_file_of_another_space(algorithm: Algorithm, saved: pathlib.Path, env: Any) -> None:
     other = gym.make(env) if isinstance(env, str) else env
     with pytest.raises(ValueError, match=r"[Oo]bservation space"):
-        KNNTD.load(saved, env=other)
+        algorithm.load(saved, env=other)
 
 
-def test_file_of_another_action_space(saved: pathlib.Path) -> None:
-    env = DriftEnv()
-    env.action_space = gym.spaces.Discrete(4)
+@pytest.mark.parametrize(
+    ("algorithm", "space"),
+    [(KNNTD, gym.spaces.Discrete(4)), (ExA, gym.spaces.Box(-1.0, 1.0, (2,), np.float64))],
+)
+def test_file_of_another_action_space(
+    algorithm: Algorithm, saved: pathlib.Path, env_cls: type[DriftEnv], space: gym.spaces.Space[Any]
+) -> None:
+    env = env_cls()
+    env.action_space = space  # type: ignore[assignment]
     with pytest.raises(ValueError, match=r"[Aa]ction space"):
-        KNNTD.load(saved, env=DummyVecEnv([lambda: env]))
+        algorithm.load(saved, env=DummyVecEnv([lambda: env]))
 
 
-def test_refused_file_leaves_the_file(saved: pathlib.Path) -> None:
+def test_refused_file_leaves_the_file(algorithm: Algorithm, saved: pathlib.Path) -> None:
     before = saved.read_bytes()
     with pytest.raises(ValueError, match="space"):
-        KNNTD.load(saved, env=gym.make("Acrobot-v1"))
-    check_untouched(saved, before)
+        algorithm.load(saved, env=gym.make("Acrobot-v1"))
+    check_untouched(algorithm, saved, before)
 
 
 @pytest.mark.parametrize("compiled", [True, False])

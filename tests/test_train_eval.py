@@ -17,35 +17,45 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from toy_envs import DriftEnv, GridEnv
 
-from sb3_knntd import KNNTD, KNNPolicy
+from sb3_knntd import KNNTD, ExA
 
-MakeModel = Callable[..., KNNTD]
+Algorithm = type[KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
+
+
+@pytest.fixture(params=[KNNTD, ExA])
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    chosen: Algorithm = request.param
+    return chosen
 
 
 # ------------------------------------------------------------------- making
 
 
-def test_every_way_of_calling_is_the_same() -> None:
-    def env() -> gym.Env[Any, Any]:
-        return gym.make("MountainCar-v0")
+def test_every_way_of_calling_is_the_same(algorithm: Algorithm, mountain_car: str) -> None:
+    env_id = mountain_car
+    policy_class = algorithm.policy_aliases["KNNPolicy"]
 
-    calls: list[Callable[..., KNNTD]] = [
-        lambda **kw: KNNTD("MountainCar-v0", **kw),
-        lambda **kw: KNNTD("KNNPolicy", env(), **kw),
-        lambda **kw: KNNTD("KNNPolicy", "MountainCar-v0", **kw),
-        lambda **kw: KNNTD(KNNPolicy, env(), **kw),
-        lambda **kw: KNNTD(policy="KNNPolicy", env=env(), **kw),
-        lambda **kw: KNNTD(env=env(), **kw),
-        lambda **kw: KNNTD(env="MountainCar-v0", **kw),
-        lambda **kw: KNNTD(env(), **kw),
-        lambda **kw: KNNTD(DummyVecEnv([env]), **kw),
+    def env() -> gym.Env[Any, Any]:
+        return gym.make(env_id)
+
+    calls: list[Callable[..., KNNTD | ExA]] = [
+        lambda **kw: algorithm(env_id, **kw),
+        lambda **kw: algorithm("KNNPolicy", env(), **kw),
+        lambda **kw: algorithm("KNNPolicy", env_id, **kw),
+        lambda **kw: algorithm(policy_class, env(), **kw),
+        lambda **kw: algorithm(policy="KNNPolicy", env=env(), **kw),
+        lambda **kw: algorithm(env=env(), **kw),
+        lambda **kw: algorithm(env=env_id, **kw),
+        lambda **kw: algorithm(env(), **kw),
+        lambda **kw: algorithm(DummyVecEnv([env]), **kw),
     ]
     models = [call(seed=0, points=8, n_neighbors=4).learn(100) for call in calls]
     assert isinstance(models[0], BaseAlgorithm)
     assert models[0].policy.q_table.any()
     for model in models[1:]:
-        assert type(model.policy) is KNNPolicy
+        assert type(model.policy) is policy_class
         assert th.equal(model.policy.q_table, models[0].policy.q_table)
 
 
@@ -141,9 +151,9 @@ def test_get_and_set_env(make_model: MakeModel, make_venv: MakeVenv) -> None:
     assert [info["l"] for info in model.ep_info_buffer or ()][-1] == 9
 
 
-def test_set_env_wraps(make_model: MakeModel) -> None:
+def test_set_env_wraps(env_cls: type[DriftEnv], make_model: MakeModel) -> None:
     model = make_model()
-    model.set_env(DriftEnv())
+    model.set_env(env_cls())
     assert isinstance(model.get_env(), VecEnv)
     assert model.learn(20).num_timesteps == 20
 
@@ -156,22 +166,22 @@ def test_set_env_refuses_what_does_not_fit(make_model: MakeModel, make_venv: Mak
         model.set_env(make_venv(2))
 
 
-def test_env_is_made_from_its_id(make_model: MakeModel) -> None:
-    model = KNNTD("FrozenLake-v1", seed=0)
+def test_env_is_made_from_its_id(algorithm: Algorithm, mountain_car: str) -> None:
+    model = algorithm(mountain_car, seed=0)
     venv = model.get_env()
     assert isinstance(venv, VecEnv)
     assert venv.num_envs == 1
     assert model.learn(50).num_timesteps == 50
 
 
-def test_model_without_environment_is_made_but_not_built() -> None:
-    model = KNNTD("KNNPolicy", env=None, _init_setup_model=False)
+def test_model_without_environment_is_made_but_not_built(algorithm: Algorithm) -> None:
+    model = algorithm("KNNPolicy", env=None, _init_setup_model=False)
     assert model.get_env() is None
 
 
-def test_building_without_environment_says_what_is_missing() -> None:
+def test_building_without_environment_says_what_is_missing(algorithm: Algorithm) -> None:
     with pytest.raises(ValueError, match="env"):
-        KNNTD()
+        algorithm()
 
 
 def test_set_random_seed_seeds_the_spaces(make_model: MakeModel) -> None:
@@ -179,7 +189,7 @@ def test_set_random_seed_seeds_the_spaces(make_model: MakeModel) -> None:
     draws = []
     for _ in range(2):
         model.set_random_seed(11)
-        draws.append([model.action_space.sample() for _ in range(10)] + list(np.random.random(3)))
+        draws.append([*(model.action_space.sample() for _ in range(10)), *np.random.random(3)])
     assert draws[0] == draws[1]
 
 
@@ -220,8 +230,8 @@ def test_parameters_go_through_a_file(make_model: MakeModel, tmp_path: pathlib.P
     assert th.equal(other.policy.q_table, learned.policy.q_table)
 
 
-def test_parameters_hold_the_ranges(observations: np.ndarray) -> None:
-    measured, other = (KNNTD("CartPole-v1", points=3, n_neighbors=2, seed=seed) for seed in (0, 1))
+def test_parameters_hold_the_ranges(algorithm: Algorithm, cart_pole: str) -> None:
+    measured, other = (algorithm(cart_pole, points=3, n_neighbors=2, seed=seed) for seed in (0, 1))
     measured.learn(1050)
     other.set_parameters(measured.get_parameters())
     assert th.equal(other.policy.points, measured.policy.points)
@@ -252,9 +262,9 @@ def test_parameters_need_no_code_to_be_read(make_model: MakeModel) -> None:
 # --------------------------------------------------------------- evaluation
 
 
-def test_evaluate_policy_equals_a_loop_by_hand(make_model: MakeModel) -> None:
+def test_evaluate_policy_equals_a_loop_by_hand(env_cls: type[DriftEnv], make_model: MakeModel) -> None:
     model = make_model().learn(200)
-    env = DriftEnv()
+    env = env_cls()
     by_hand = []
     for _ in range(3):
         observation, _ = env.reset()
@@ -264,7 +274,7 @@ def test_evaluate_policy_equals_a_loop_by_hand(make_model: MakeModel) -> None:
             observation, reward, terminated, truncated, _ = env.step(action)
             total, done = total + reward, terminated or truncated
         by_hand.append(total)
-    mean, _ = evaluate_policy(model, DriftEnv(), n_eval_episodes=3, deterministic=True, warn=False)
+    mean, _ = evaluate_policy(model, env_cls(), n_eval_episodes=3, deterministic=True, warn=False)
     assert mean == pytest.approx(np.mean(by_hand), rel=1e-5)
 
 

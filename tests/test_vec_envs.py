@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -25,13 +24,20 @@ from stable_baselines3.common.vec_env import (
 )
 from toy_envs import DriftEnv, GridEnv
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, ExA
 
-MakeModel = Callable[..., KNNTD]
+Algorithm = type[KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
 
 
-def check_learned(model: KNNTD, n_steps: int) -> None:
+@pytest.fixture(params=[KNNTD, ExA])
+def algorithm(request: pytest.FixtureRequest) -> Algorithm:
+    chosen: Algorithm = request.param
+    return chosen
+
+
+def check_learned(model: KNNTD | ExA, n_steps: int) -> None:
     assert model.num_timesteps == n_steps
     assert model.policy.q_table.any()
     assert th.isfinite(model.policy.q_table).all()
@@ -80,27 +86,27 @@ def test_environments_share_one_table(make_model: MakeModel, make_venv: MakeVenv
     assert int(model.policy.q_table.any(dim=1).sum()) > 4
 
 
-def test_many_equal_environments_learn_as_stably_as_one(make_model: MakeModel) -> None:
+def test_many_equal_environments_learn_as_stably_as_one(env_cls: type[DriftEnv], make_model: MakeModel) -> None:
     settings = {"exploration_initial_eps": 0.0, "tie_break": "first"}
-    one = make_model(DummyVecEnv([DriftEnv]), **settings).learn(60)
+    one = make_model(DummyVecEnv([env_cls]), **settings).learn(60)
     # Sixty-four times the same must not be a step sixty-four times as large.
-    many = make_model(DummyVecEnv([DriftEnv] * 64), **settings).learn(60 * 64)
+    many = make_model(DummyVecEnv([env_cls] * 64), **settings).learn(60 * 64)
     th.testing.assert_close(many.policy.q_table, one.policy.q_table)
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_frame_stack(make_venv: MakeVenv, n_envs: int) -> None:
+def test_frame_stack(algorithm: Algorithm, make_venv: MakeVenv, n_envs: int) -> None:
     venv = VecFrameStack(make_venv(n_envs), n_stack=2)
     low, high = np.tile(DriftEnv.LOW, 2), np.tile(DriftEnv.HIGH, 2)
-    model = KNNTD(venv, points=4, bounds=(low, high), seed=0).learn(60 * n_envs)
+    model = algorithm(venv, points=4, bounds=(low, high), seed=0).learn(60 * n_envs)
     check_learned(model, 60 * n_envs)
     assert model.policy.points.shape == (4**4, 4)
-    assert model.predict(venv.reset())[0].shape == (n_envs,)
+    assert model.predict(venv.reset())[0].shape == (n_envs, *(venv.action_space.shape or ()))
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_monitor(make_model: MakeModel, n_envs: int) -> None:
-    model = make_model(VecMonitor(DummyVecEnv([DriftEnv] * n_envs))).learn(30 * n_envs)
+def test_monitor(env_cls: type[DriftEnv], make_model: MakeModel, n_envs: int) -> None:
+    model = make_model(VecMonitor(DummyVecEnv([env_cls] * n_envs))).learn(30 * n_envs)
     check_learned(model, 30 * n_envs)
     assert [info["l"] for info in model.ep_info_buffer or ()] == [9] * n_envs + [14] * n_envs + [6] * n_envs
 
@@ -113,24 +119,24 @@ def test_check_nan(make_model: MakeModel, make_venv: MakeVenv) -> None:
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_normalised_observations_are_measured(make_venv: MakeVenv, n_envs: int) -> None:
+def test_normalised_observations_are_measured(algorithm: Algorithm, make_venv: MakeVenv, n_envs: int) -> None:
     venv = VecNormalize(make_venv(n_envs))
-    model = KNNTD(venv, points=5, seed=0).learn(1300)
+    model = algorithm(venv, points=5, seed=0).learn(1300)
     check_learned(model, 1300 + -1300 % n_envs)
     assert model.get_vec_normalize_env() is venv
     # The space speaks of ±3 and ±1, and of what was divided by its spread: the points go by what was seen.
     seen = [venv.reset()]
     for _ in range(30):
-        seen.append(venv.step(np.full(n_envs, 1))[0])
+        seen.append(venv.step(np.stack([venv.action_space.sample()] * n_envs))[0])
     low, high = model.policy.points.amin(dim=0).numpy(), model.policy.points.amax(dim=0).numpy()
     inside = np.mean((np.concatenate(seen) >= low) & (np.concatenate(seen) <= high))
     assert inside > 0.9
     assert (high - low < 12).all()
 
 
-def test_normalised_rewards_alone_leave_the_space_its_range(make_venv: MakeVenv) -> None:
+def test_normalised_rewards_alone_leave_the_space_its_range(algorithm: Algorithm, make_venv: MakeVenv) -> None:
     venv = VecNormalize(make_venv(), norm_obs=False)
-    model = KNNTD(venv, points=5, seed=0)
+    model = algorithm(venv, points=5, seed=0)
     points = model.policy.points.clone()
     model.learn(60)
     check_learned(model, 60)
@@ -138,16 +144,18 @@ def test_normalised_rewards_alone_leave_the_space_its_range(make_venv: MakeVenv)
     np.testing.assert_allclose(points.amax(dim=0).numpy(), [3.0, 1.0])
 
 
-def test_given_bounds_are_those_of_normalised_observations(make_venv: MakeVenv) -> None:
-    model = KNNTD(VecNormalize(make_venv()), points=5, bounds=([-2, -2], [2, 2]), seed=0).learn(60)
+def test_given_bounds_are_those_of_normalised_observations(algorithm: Algorithm, make_venv: MakeVenv) -> None:
+    model = algorithm(VecNormalize(make_venv()), points=5, bounds=([-2, -2], [2, 2]), seed=0).learn(60)
     check_learned(model, 60)
     np.testing.assert_allclose(model.policy.points.amax(dim=0).numpy(), [2.0, 2.0])
 
 
-def test_truncation_bootstraps_from_the_normalised_last_observation() -> None:
+def test_truncation_bootstraps_from_the_normalised_last_observation(
+    algorithm: Algorithm, env_cls: type[DriftEnv]
+) -> None:
     # At a truncation that is its whole episode, r + γ Q(s') is all there is to learn; Q(s') = 10 everywhere.
-    venv = VecNormalize(make_vec_env(lambda: DriftEnv(lengths=[1], ends=["truncated"]), 1), norm_reward=False)
-    model = KNNTD(
+    venv = VecNormalize(make_vec_env(lambda: env_cls(lengths=[1], ends=["truncated"]), 1), norm_reward=False)
+    model = algorithm(
         venv, points=1, bounds=([-2, -2], [2, 2]), n_neighbors=1, learning_rate=1.0, gamma=0.5, initial_value=10.0
     )
     rewards: list[float] = []
@@ -155,14 +163,14 @@ def test_truncation_bootstraps_from_the_normalised_last_observation() -> None:
     assert float(model.policy.q_table.min()) == pytest.approx(rewards[0] + 5.0)
 
 
-def test_normalisation_is_saved_beside(make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+def test_normalisation_is_saved_beside(algorithm: Algorithm, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
     venv = VecNormalize(make_venv(2))
-    model = KNNTD(venv, points=5, seed=0).learn(1200)
+    model = algorithm(venv, points=5, seed=0).learn(1200)
     model.save(tmp_path / "model")
     venv.save(str(tmp_path / "normalize.pkl"))
 
     again = VecNormalize.load(str(tmp_path / "normalize.pkl"), make_venv(2))
-    loaded = KNNTD.load(tmp_path / "model", env=again)
+    loaded = algorithm.load(tmp_path / "model", env=again)
     assert th.equal(loaded.policy.points, model.policy.points)
     places = np.float32([[0.0, 0.0], [0.3, -0.01], [-0.8, 0.02]])
     normalised = venv.normalize_obs(places)
@@ -177,29 +185,14 @@ def test_normalisation_is_saved_beside(make_venv: MakeVenv, tmp_path: pathlib.Pa
 # ----------------------------------------------------- episodes and their ends
 
 
-def test_end_of_one_environment_leaves_the_others(make_model: MakeModel) -> None:
-    def venv() -> VecEnv:
-        # Two far corners, so that the environments meet at no point; the first ends at every step.
-        return DummyVecEnv(
-            [lambda: Still([-0.9, -0.04], length=1), lambda: Still([0.4, 0.05], length=100)],
-        )
-
-    settings = {"exploration_initial_eps": 0.0, "tie_break": "first", "gamma": 0.9}
-    both = make_model(venv(), **settings).learn(40)
-    alone = make_model(DummyVecEnv([lambda: Still([0.4, 0.05], length=100)]), **settings).learn(20)
-    place = np.float32([0.4, 0.05])
-    th.testing.assert_close(both.policy.q_values(place), alone.policy.q_values(place))
-    assert alone.policy.q_values(place).any()
-
-
 class Still(gym.Env[Any, Any]):
     """Stays where it is, at a reward of 1 a step."""
 
-    def __init__(self, place: list[float], length: int) -> None:
+    def __init__(self, place: list[float], length: int, env_cls: type[DriftEnv]) -> None:
         self.place = np.array(place, dtype=np.float32)
         self.length = length
-        self.observation_space = DriftEnv().observation_space
-        self.action_space = spaces.Discrete(3)
+        self.observation_space = env_cls().observation_space
+        self.action_space = env_cls().action_space
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.elapsed = 0
@@ -210,10 +203,25 @@ class Still(gym.Env[Any, Any]):
         return self.place, 1.0, self.elapsed >= self.length, False, {}
 
 
+def test_end_of_one_environment_leaves_the_others(env_cls: type[DriftEnv], make_model: MakeModel) -> None:
+    def venv() -> VecEnv:
+        # Two far corners, so that the environments meet at no point; the first ends at every step.
+        return DummyVecEnv(
+            [lambda: Still([-0.9, -0.04], 1, env_cls), lambda: Still([0.4, 0.05], 100, env_cls)],
+        )
+
+    settings = {"exploration_initial_eps": 0.0, "tie_break": "first", "gamma": 0.9}
+    both = make_model(venv(), **settings).learn(40)
+    alone = make_model(DummyVecEnv([lambda: Still([0.4, 0.05], 100, env_cls)]), **settings).learn(20)
+    place = np.float32([0.4, 0.05])
+    th.testing.assert_close(both.policy.q_values(place), alone.policy.q_values(place))
+    assert alone.policy.q_values(place).any()
+
+
 @pytest.mark.parametrize(("end", "value"), [("terminated", 1.0), ("truncated", 1.0 + 0.5 * 10.0)])
-def test_value_at_the_end_of_an_episode(end: str, value: float) -> None:
-    env = gym.wrappers.TransformReward(DriftEnv(lengths=[1], ends=[end]), lambda _: 1.0)
-    model = KNNTD(env, points=1, n_neighbors=1, learning_rate=1.0, gamma=0.5, initial_value=10.0).learn(1)
+def test_value_at_the_end_of_an_episode(algorithm: Algorithm, env_cls: type[DriftEnv], end: str, value: float) -> None:
+    env = gym.wrappers.TransformReward(env_cls(lengths=[1], ends=[end]), lambda _: 1.0)
+    model = algorithm(env, points=1, n_neighbors=1, learning_rate=1.0, gamma=0.5, initial_value=10.0).learn(1)
     assert float(model.policy.q_table.min()) == pytest.approx(value)
 
 

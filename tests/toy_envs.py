@@ -77,6 +77,33 @@ class DriftEnv(EpisodeEnv):
         return np.array([self.x, self.v], dtype=np.float32)
 
 
+class PushEnv(DriftEnv):
+    """The drifting point, pushed by all numbers of a Box action, each with a different effect."""
+
+    def __init__(
+        self,
+        shape: tuple[int, ...] = (1,),
+        low: Any = -1.0,
+        high: Any = 1.0,
+        dtype: Any = np.float64,
+        unbounded: bool = False,
+        **arguments: Any,
+    ) -> None:
+        super().__init__(**arguments)
+        self.action_space = spaces.Box(low, high, shape, dtype=dtype)  # type: ignore[assignment]
+        if unbounded:
+            self.observation_space = spaces.Box(-np.inf, np.inf, (2,), dtype=np.float32)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), action
+        pushes = np.asarray(action, dtype=np.float64).ravel() / np.arange(1, np.size(action) + 1)
+        self.v += 0.009 * pushes.sum() - 0.0061 * np.cos(3.0 * self.x)
+        self.x += self.v
+        reward = -1.0 + 0.6 * np.sin(4.0 * self.x) - 4.0 * abs(self.v) - 0.2 * np.sum((pushes - 0.4) ** 2)
+        terminated, truncated = self._end_of_step()
+        return self._observe(), float(reward), terminated, truncated, {}
+
+
 class GridEnv(EpisodeEnv):
     """A torus of cells, seen as one number (``discrete``), two (``multi_discrete``) or a ``box`` of ints."""
 
