@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import socket
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -17,6 +20,7 @@ import pytest
 import ray
 from ray._private import ray_constants
 from ray.cluster_utils import Cluster
+from ray.util.client.server.server import serve
 
 from sb3_knntd.cli import main
 from sb3_knntd.jobs import Job, run_jobs
@@ -107,6 +111,27 @@ def test_the_backend_does_not_change_what_is_learned(cluster: Cluster, tmp_path:
     before = {name: (tmp_path / "ray" / "runs" / name).stat().st_mtime_ns for name in names}
     assert main([*arguments, "--out", str(tmp_path / "ray")]) == 0
     assert before == {name: (tmp_path / "ray" / "runs" / name).stat().st_mtime_ns for name in names}
+
+
+@pytest.mark.slow
+def test_a_cluster_elsewhere(cluster: Cluster, tmp_path: Path) -> None:
+    """By Ray's own client, from a program that is no part of the cluster."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    server = serve("127.0.0.1", port)
+    program = "import sys; from sb3_knntd.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "compare", "--env", "compare/Corridor-v0", "--algos", "random"]
+    command += ["--seeds", "2", "--steps", "300", "--eval-points", "3", "--eval-episodes", "2"]
+    command += ["--gym-packages", "compare_envs", "--backend", "ray", "--address", f"ray://127.0.0.1:{port}"]
+    try:
+        subprocess.run(
+            [*command, "--out", str(tmp_path)], env={**os.environ, "PYTHONPATH": TESTS}, timeout=300, check=True
+        )
+    finally:
+        server.stop(0)
+    assert len(list((tmp_path / "runs").iterdir())) == 2
+    assert (tmp_path / "report.html").exists()
 
 
 def test_what_is_interrupted_is_stopped(cluster: Cluster, tmp_path: Path) -> None:
