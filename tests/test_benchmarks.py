@@ -234,3 +234,20 @@ def test_the_zoo_benchmark_refuses_seeds(benchmarks: Any, monkeypatch: pytest.Mo
     monkeypatch.setattr(sys, "argv", ["zoo", "--seeds", words])
     with pytest.raises(SystemExit, match="2"):
         benchmarks("zoo").main()
+
+
+def test_competition_counts_the_steps_of_each_episode(benchmarks: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    competition = benchmarks("competition")
+    monkeypatch.setattr(competition, "EPISODES", 3)
+    monkeypatch.setattr(competition, "MOST_STEPS", 50)
+    # Nobody leaves the valley in so few steps.
+    for sight in competition.SIGHTS:
+        assert competition.learn(sight, 7) == [50, 50, 50]
+
+
+def test_competition_is_learned_with_the_stored_configuration(benchmarks: Any) -> None:
+    competition = benchmarks("competition")
+    settings = competition.settings()
+    assert settings["bounds"] == "adaptive"
+    assert not {"policy", "n_timesteps", "vec_env_wrapper"} & set(settings)
+    KNNTD(competition.ENV_ID, **settings)
