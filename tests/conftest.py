@@ -12,9 +12,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
-from toy_envs import DriftEnv, PushEnv
+from toy_envs import DriftEnv, GridEnv, PushEnv
 
 import sb3_knntd.envs  # noqa: F401  registers the continuous cart-pole
 from sb3_knntd import KNNTD, ExA
@@ -45,6 +46,24 @@ def mountain_car(algorithm: type[KNNTD | ExA]) -> str:
 def cart_pole(algorithm: type[KNNTD | ExA]) -> str:
     """The id of the cart-pole with the actions that the algorithm takes: two of its dimensions have no range."""
     return "sb3_knntd/ContinuousCartPole-v0" if algorithm is ExA else "CartPole-v1"
+
+
+def _number_of_move(action: np.ndarray) -> int:
+    return round(1.5 * (float(action[0]) + 1.0))
+
+
+@pytest.fixture
+def make_grid(algorithm: type[KNNTD | ExA]) -> Callable[..., gym.Env[Any, Any]]:
+    """Makes ``make_grid(kind, **episodes)``: the torus of cells with the actions that the algorithm takes."""
+
+    def make(kind: str = "discrete", **episodes: Any) -> gym.Env[Any, Any]:
+        env = GridEnv(kind, **episodes)
+        if algorithm is ExA:
+            box = spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
+            return gym.wrappers.TransformAction(env, _number_of_move, box)
+        return env
+
+    return make
 
 
 def _monitored(env_cls: type[DriftEnv], **kwargs: Any) -> gym.Env[Any, Any]:

@@ -1,4 +1,4 @@
-"""Ex⟨a⟩(lambda): the table against `reference_exa.py`, and how it behaves as an SB3 algorithm."""
+"""Ex⟨a⟩(lambda): the table against `reference_exa.py`, and what it alone has; the rest is tested over both."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import NearestPoints, Rates
@@ -628,7 +627,7 @@ def test_files_of_the_other_algorithm_are_refused(tmp_path: pathlib.Path) -> Non
         assert f"holds a model of {holds}, not of {cls.__name__}" in message
 
 
-# ------------------------------------------------------------------------------------- as SB3 has it
+# ----------------------------------------------------------------------- ranges, environments, precision
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -649,14 +648,6 @@ def test_unbounded_observations_are_measured(learner: str, action_table: str) ->
     low, high = model.policy.points.min(dim=0).values.numpy(), model.policy.points.max(dim=0).values.numpy()
     assert (low <= seen.min(axis=0) + 1e-6).all()
     assert (high >= seen.max(axis=0) - 1e-6).all()
-
-
-def test_finite_observations() -> None:
-    env = gym.wrappers.TransformObservation(PushEnv(), lambda _: 1, spaces.Discrete(4))
-    model = ExA(env, seed=0).learn(100)
-    assert model.policy.q_table.shape == (4, 3)
-    assert model.policy.q_table.any()
-    assert model.action_space.contains(model.predict(np.array(2), deterministic=True)[0])
 
 
 def test_the_papers_cart_pole() -> None:

@@ -12,11 +12,12 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
-from toy_envs import DriftEnv, GridEnv
+from toy_envs import DriftEnv
 
 from sb3_knntd import KNNTD, ExA, Perception
 
 Algorithm = type[KNNTD | ExA]
+MakeGrid = Callable[..., gym.Env[Any, Any]]
 MakeModel = Callable[..., KNNTD | ExA]
 
 # What only an algorithm of Discrete actions has.
@@ -115,18 +116,18 @@ def test_tensors_are_perceived_as_arrays_are(model: KNNTD | ExA, observations: n
 
 
 @pytest.mark.parametrize("kind", ["discrete", "multi_discrete"])
-def test_states_by_number(kind: str) -> None:
-    env = GridEnv(kind)
-    model = KNNTD(env, seed=0).learn(50)
+def test_states_by_number(algorithm: Algorithm, make_grid: MakeGrid, kind: str) -> None:
+    env = make_grid(kind)
+    model = algorithm(env, seed=0).learn(50)
     observation, _ = env.reset()
     action, _ = model.predict(observation, deterministic=True)
-    assert np.shape(action) == ()
+    assert model.action_space.contains(action)
     actions, _ = model.predict(np.stack([np.asarray(observation)] * 3), deterministic=True)
-    assert actions.tolist() == [int(action)] * 3
+    assert actions.tolist() == [action.tolist()] * 3
 
 
-def test_plain_int_is_a_state() -> None:
-    model = KNNTD("FrozenLake-v1", seed=0)
+def test_plain_int_is_a_state(algorithm: Algorithm, make_grid: MakeGrid) -> None:
+    model = algorithm(make_grid(), seed=0)
     assert model.policy.perceive(5).indices.tolist() == [[5]]
     assert model.action_space.contains(model.predict(5)[0])
 

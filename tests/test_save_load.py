@@ -26,6 +26,7 @@ from toy_envs import DriftEnv, GridEnv
 from sb3_knntd import KNNTD, ExA
 
 Algorithm = type[KNNTD | ExA]
+MakeGrid = Callable[..., gym.Env[Any, Any]]
 MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
 
@@ -56,8 +57,6 @@ KNNTD_SETTINGS: dict[str, dict[str, Any]] = {
     "expected_sarsa": {"target": "expected_sarsa", "exploration_initial_eps": 0.3},
 }
 EXA_SETTINGS: dict[str, dict[str, Any]] = {
-    "long hold": {"exploration_hold": 1e6, "exploration_initial_eps": 0.7, "exploration_final_eps": 0.7},
-    "automatic hold": {"exploration_hold": "auto", "exploration_initial_eps": 0.7},
     "per neighbor": {"exploration": "per_neighbor", "exploration_initial_eps": 0.3},
     "other action points": {"action_points": [[-1.0, -0.13, 0.71, 0.9]]},
 }
@@ -267,10 +266,10 @@ def test_measured_ranges_are_kept_without_the_environment(
 
 
 @pytest.mark.parametrize("kind", ["discrete", "multi_discrete"])
-def test_exact_tables_are_kept(tmp_path: pathlib.Path, kind: str) -> None:
-    model = KNNTD(GridEnv(kind), seed=0).learn(150)
+def test_exact_tables_are_kept(algorithm: Algorithm, make_grid: MakeGrid, tmp_path: pathlib.Path, kind: str) -> None:
+    model = algorithm(make_grid(kind), seed=0).learn(150)
     model.save(tmp_path / "model")
-    loaded = KNNTD.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     assert same_table(loaded, model)
     states = model.policy.points.numpy().squeeze().astype(np.int64)
     assert np.array_equal(loaded.predict(states, deterministic=True)[0], model.predict(states, deterministic=True)[0])

@@ -20,6 +20,7 @@ from toy_envs import DriftEnv, GridEnv
 from sb3_knntd import KNNTD, ExA
 
 Algorithm = type[KNNTD | ExA]
+MakeGrid = Callable[..., gym.Env[Any, Any]]
 MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
 
@@ -122,10 +123,12 @@ def test_learning_anew_counts_anew_in_new_episodes_with_the_same_table(make_mode
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_traces_do_not_outlive_a_reset(make_venv: MakeVenv, n_envs: int) -> None:
+def test_traces_do_not_outlive_a_reset(algorithm: Algorithm, make_grid: MakeGrid, n_envs: int) -> None:
     # With λ = γ = 1 whatever was visited since the traces began is credited with every error.
-    venv = DummyVecEnv([lambda: GridEnv(lengths=[100])] * n_envs)
-    model = KNNTD(venv, gamma=1.0, trace_decay=1.0, learning_rate=0.5, exploration_initial_eps=0.0, tie_break="first")
+    venv = DummyVecEnv([lambda: make_grid(lengths=[100])] * n_envs)
+    model = algorithm(
+        venv, gamma=1.0, trace_decay=1.0, learning_rate=0.5, exploration_initial_eps=0.0, tie_break="first"
+    )
     model.learn(3 * n_envs)
     before = model.policy.q_table.clone()
     first_episode = before.any(dim=1)
