@@ -180,6 +180,23 @@ def jobs(algo: str, env_id: str, settings: Mapping[str, Any], seeds: Sequence[in
     return [Job(f"{algo}-{name}-{seed}", play, arguments | {"seed": seed}) for seed in seeds]
 
 
+def summary(row: Row) -> dict[str, Any]:
+    """
+    :param row: what was learned
+    :return: its figures, those of each seed in the order of the seeds
+    """
+    return {
+        "algo": row.algo,
+        "env_id": row.env_id,
+        "n_timesteps": row.n_timesteps,
+        "eval_episodes": int(np.size(row.returns)),
+        "seeds": row.seeds,
+        "mean_reward": np.mean(row.returns, axis=1).tolist(),
+        "std_reward": np.std(row.returns, axis=1).tolist(),
+        "seconds": row.seconds,
+    }
+
+
 def line(row: Row) -> list[str]:
     """
     :param row: what was learned
@@ -320,7 +337,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=100, help="the configurations were tuned on others")
     parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
     parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"), help="folder where runs are kept")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also store the returns of all episodes")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also store every seed's figures")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the page of the documentation")
     arguments = parser.parse_args()
     try:
@@ -341,8 +358,8 @@ def main() -> None:
     if rows:
         print(table(rows))
         if arguments.json:
-            stored = {"machine": describe(), "rows": [row._asdict() for row in rows]}
-            replace_file(arguments.json, json.dumps(stored).encode())
+            stored = {"machine": describe(), "rows": [summary(row) for row in rows]}
+            replace_file(arguments.json, json.dumps(stored, indent=1).encode())
         if arguments.markdown:
             command = f"python -m benchmarks.zoo {shlex.join(sys.argv[1:])}"
             replace_file(arguments.markdown, page(rows, command).encode())
