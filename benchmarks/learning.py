@@ -21,10 +21,10 @@ import torch as th
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.utils import LinearSchedule
 
 from benchmarks.machine import describe
 from sb3_knntd import KNNTD, ExA
+from sb3_knntd.zoo.schedules import with_schedules
 
 EPISODES = 100
 
@@ -77,12 +77,10 @@ def tuned_settings(algorithm: str, env_id: str) -> dict[str, Any]:
     """
     :param algorithm: ``"knntd"`` or ``"exa"``
     :param env_id: environment
-    :return: its arguments in ``zoo_configs/``, schedules in RL Zoo's form (``lin_0.7``) made into functions
+    :return: its arguments in ``zoo_configs/``, schedules made into functions
     """
     settings = yaml.safe_load(files("sb3_knntd.zoo_configs").joinpath(f"{algorithm}.yml").read_text())[env_id]
-    if str(settings["learning_rate"]).startswith("lin_"):
-        settings["learning_rate"] = LinearSchedule(float(settings["learning_rate"][4:]), 0.0, 1.0)
-    return {name: value for name, value in settings.items() if name not in ("n_timesteps", "policy")}
+    return with_schedules({name: value for name, value in settings.items() if name not in ("n_timesteps", "policy")})
 
 
 def play(case: Case, seed: int) -> float:
