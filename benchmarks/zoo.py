@@ -206,9 +206,9 @@ def line(row: Row) -> list[str]:
     return [
         f"**{row.algo}**",
         row.env_id,
-        f"{np.mean(row.returns):.1f}",
-        f"{np.std(row.returns):.1f}",
-        f"{median:.1f} [{low:.1f}, {high:.1f}]",
+        f"{np.mean(row.returns):.2f}",
+        f"{np.std(row.returns):.2f}",
+        f"{median:.2f} [{low:.2f}, {high:.2f}]",
         steps(row.n_timesteps),
         str(len(row.seeds)),
         str(np.size(row.returns)),
@@ -221,7 +221,7 @@ def published_line(figure: Published) -> list[str]:
     :param figure: of RL Zoo
     :return: its line of the table
     """
-    reward = [f"{figure.mean_reward:.1f}", f"{figure.std_reward:.1f}"]
+    reward = [f"{figure.mean_reward:.2f}", f"{figure.std_reward:.2f}"]
     return [figure.algo, figure.env_id, *reward, "", steps(figure.n_timesteps), "1", "", ""]
 
 

@@ -201,10 +201,10 @@ def test_the_zoo_benchmark_stands_beside_published_figures(benchmarks: Any) -> N
     row = zoo.Row("knntd", "LunarLander-v3", 500_000, [7, 8], [[100.0, 300.0], [0.0, 0.0]], [2.0, 4.0])
     _, _, ours, *theirs = zoo.table([row]).splitlines()
     assert [cell.strip() for cell in ours.strip("|").split("|")] == [
-        *("**knntd**", "LunarLander-v3", "100.0", "122.5", "100.0 [20.0, 180.0]", "500k", "2", "4", "3 s")
+        *("**knntd**", "LunarLander-v3", "100.00", "122.47", "100.00 [20.00, 180.00]", "500k", "2", "4", "3 s")
     ]
     assert len(theirs) == 3
-    assert "| ppo | LunarLander-v2 | 242.1 | 31.8 |  | 1M | 1 |" in theirs[2]
+    assert "| ppo | LunarLander-v2 | 242.12 | 31.82 |  | 1M | 1 |" in theirs[2]
     # Mountain-Car of the paper is another environment than gymnasium's.
     assert len(zoo.table([row._replace(env_id="sb3_knntd/MountainCar-v0")]).splitlines()) == 3
 
@@ -228,7 +228,7 @@ def test_the_zoo_benchmark_writes_what_was_learned_and_tells_what_failed(
     assert row["seeds"] == [5, 7]
     assert (row["mean_reward"], row["std_reward"]) == ([-105.0, -105.0], [5.0, 5.0])
     assert f"python -m benchmarks.zoo {' '.join(command)}" in page.read_text()
-    assert "| **knntd** | MountainCar-v0 | -105.0 | 5.0 | -105.0 [-105.0, -105.0] |" in page.read_text()
+    assert "| **knntd** | MountainCar-v0 | -105.00 | 5.00 | -105.00 [-105.00, -105.00] |" in page.read_text()
 
 
 @pytest.mark.parametrize("words", ["0", "ten", "MountainCar-v0=", "=3", "MountainCar-v0=0", "Elsewhere-v0=3"])
