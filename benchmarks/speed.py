@@ -82,7 +82,7 @@ class Row(NamedTuple):
     def reached(self) -> bool:
         """Whether the median reaches the target."""
         sign, limit = self.target.split()
-        return self.ratio >= float(limit) if sign == ">=" else self.ratio <= float(limit)
+        return bool(self.ratio >= float(limit) if sign == ">=" else self.ratio <= float(limit))
 
 
 def compare(

@@ -339,8 +339,10 @@ class ExAPolicy(KNNPolicy):
         if self._actions_are_whole:
             actions = np.rint(actions)
         fitting: np.ndarray = actions.reshape(-1, *space.shape).astype(space.dtype)
-        np.maximum(fitting, space.low, out=fitting)
-        np.minimum(fitting, space.high, out=fitting)
+        # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
+        if space.dtype != np.float32:
+            np.maximum(fitting, space.low, out=fitting)
+            np.minimum(fitting, space.high, out=fitting)
         return fitting
 
     def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:

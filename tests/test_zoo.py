@@ -180,8 +180,8 @@ def test_progress_bar(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None
 
 
 def test_an_environment_without_configuration_gets_the_defaults(tmp_path: Path) -> None:
-    model = saved_model("knntd", train(tmp_path, "knntd", "Acrobot-v1", "-n", 100, "--eval-freq", -1))
-    fresh = KNNTD("Acrobot-v1")
+    model = saved_model("knntd", train(tmp_path, "knntd", "FrozenLake8x8-v1", "-n", 100, "--eval-freq", -1))
+    fresh = KNNTD("FrozenLake8x8-v1")
     for name in ("points", "n_neighbors", "gamma", "trace_decay", "exploration_initial_eps"):
         assert getattr(model, name) == getattr(fresh, name)
     assert model.lr_schedule(0.5) == fresh.lr_schedule(0.5)
