@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.metadata import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -113,8 +114,10 @@ def test_commands_exist_and_take_their_arguments(page: Path, words: list[str], m
         targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert set(arguments) <= set(targets)
     elif program == "pip":
-        asked = re.findall(r"\[([\w,-]+)\]", " ".join(arguments))
-        assert {extra for extras in asked for extra in extras.split(",")} <= PROJECT["optional-dependencies"].keys()
+        for package, extras in re.findall(r"([\w.-]+)\[([\w,-]+)\]", " ".join(arguments)):
+            ours = package in (".", "sb3-knntd")
+            there = PROJECT["optional-dependencies"] if ours else metadata(package).get_all("Provides-Extra")
+            assert set(extras.split(",")) <= set(there)
     elif Path(program).name == "python" and arguments[0] == "-m":
         module = arguments[1]
         assert find_spec(module) is not None
