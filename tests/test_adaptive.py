@@ -268,3 +268,17 @@ def test_states_have_no_range_to_follow() -> None:
 def test_other_words_are_refused() -> None:
     with pytest.raises(ValueError, match=r"bounds must be None, 'adaptive', or a pair .*; got 'wide'"):
         KNNTD("MountainCar-v0", bounds="wide")
+
+
+def test_beyond_the_space_there_is_nothing_to_follow() -> None:
+    """Noise carries observations past the space's bounds; the table is not carried over for that, at every step anew."""
+    model = make_random()
+    model.policy.perceiver.measure(th.tensor([[-40.0, -2.0], [40.0, 2.0]]))
+    values = model.policy.q_table.clone()
+    assert model.policy.perceiver.sees(np.array([[-41.0, 0.0], [47.0, 0.0]]))
+    assert not model.policy.perceiver.sees(np.array([[-41.0, 9.0]]))
+    model.policy.widen(th.tensor([[-41.0, 9.0]]))
+    low, high = box(model)
+    assert (low[0], high[0]) == (-40.0, 40.0)
+    assert high[1] > 9.0
+    assert not th.equal(model.policy.q_table, values)

@@ -106,6 +106,14 @@ class Bounds(nn.Module):
             th.where(highest > self.high, highest + margin, self.high),
         )
 
+    def reach(self) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :return: beyond which observations :meth:`widen` would move a bound, low and high, each of shape (obs_dim,);
+            infinite where a bound stands at the last that it may take
+        """
+        low = th.where(self.low > self.lowest, self.low, -th.inf)
+        return low, th.where(self.high < self.highest, self.high, th.inf)
+
     def _set(self, low: th.Tensor, high: th.Tensor) -> None:
         self.low.copy_(th.maximum(low, self.lowest))
         self.high.copy_(th.minimum(high, self.highest))

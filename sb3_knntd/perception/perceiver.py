@@ -86,7 +86,7 @@ class Perceiver(nn.Module):
     def fit(self) -> None:
         """Bring the search up to date with the bounds and their device."""
         self.search.fit(self.bounds)
-        self._low, self._high = self.bounds.low.cpu().numpy(), self.bounds.high.cpu().numpy()
+        self._reach = [bound.cpu().numpy() for bound in self.bounds.reach()]
         self.eyes = self._make_eyes()
         self.search_is_outside = self.eyes is not None and self.eyes[3] == FOUND
 
@@ -116,9 +116,9 @@ class Perceiver(nn.Module):
     def sees(self, observations: np.ndarray) -> bool:
         """
         :param observations: shape (batch, *obs_shape), any number type, observation units
-        :return: whether all lie within the bounds
+        :return: whether there is nothing to :meth:`widen`: all lie within the bounds, or beyond those that cannot move
         """
-        return bool(are_within(observations.reshape(-1, self.bounds.obs_dim), self._low, self._high))
+        return bool(are_within(observations.reshape(-1, self.bounds.obs_dim), *self._reach))
 
     def widen(self, observations: th.Tensor) -> Regridding | None:
         """
