@@ -83,6 +83,35 @@ def positive_float(text: str) -> float:
     return number
 
 
+def _add_seeds(parser: argparse.ArgumentParser, default: int, first_seed_help: str) -> None:
+    parser.add_argument(
+        "--seeds", type=positive_int, default=default, metavar="N", help="number of seeds (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--first-seed", type=seed_int, default=1000, metavar="N", help=f"{first_seed_help} (default: %(default)s)"
+    )
+
+
+def _seeds(args: argparse.Namespace) -> range:
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    if seeds[-1] >= 2**31:
+        raise CommandError(f"seeds go to 2147483647; got {args.seeds} from {args.first_seed} on")
+    return seeds
+
+
+def _resumable(command: Callable[[], int], out: Path) -> int:
+    """
+    :param command: keeps what is finished
+    :param out: where
+    :return: its exit code, or that of an interruption, of which the user is told
+    """
+    try:
+        return command()
+    except KeyboardInterrupt:
+        print(f"\nInterrupted. What is finished is in {out}: the same command goes on from there.", file=sys.stderr)
+        return INTERRUPTED
+
+
 def require(*modules: str, extra: str = "extra") -> None:
     """
     :param modules: modules that the command cannot do without
@@ -131,16 +160,7 @@ def _add_reproduce(subparsers: Subparsers) -> None:
     figures = "; ".join(f"{name}: {figure.help}" for name, figure in FIGURES.items())
     parser.add_argument("figure", choices=FIGURES, metavar="FIGURE", help=figures)
     parser.add_argument("--best", action="store_true", help="this project's best settings, not the paper's")
-    parser.add_argument(
-        "--seeds", type=positive_int, default=30, metavar="N", help="number of seeds (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--first-seed",
-        type=seed_int,
-        default=1000,
-        metavar="N",
-        help="the best settings were tuned on seeds below 1000 (default: %(default)s)",
-    )
+    _add_seeds(parser, 30, "the best settings were tuned on seeds below 1000")
     parser.add_argument("--episodes", type=positive_int, metavar="N", help="episodes of each seed")
     parser.add_argument("--workers", type=positive_int, metavar="N", help="processes (default: one a core)")
     parser.add_argument(
@@ -153,16 +173,8 @@ def _run_reproduce(args: argparse.Namespace) -> int:
     require("tqdm", "matplotlib", "yaml")
     from sb3_knntd.reproduce.command import reproduce
 
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
-    if seeds[-1] >= 2**31:
-        raise CommandError(f"seeds go to 2147483647; got {args.seeds} from {args.first_seed} on")
-    try:
-        return reproduce(args.figure, args.best, seeds, args.episodes, args.out, args.workers)
-    except KeyboardInterrupt:
-        print(
-            f"\nInterrupted. What is finished is in {args.out}: the same command goes on from there.", file=sys.stderr
-        )
-        return INTERRUPTED
+    seeds = _seeds(args)
+    return _resumable(lambda: reproduce(args.figure, args.best, seeds, args.episodes, args.out, args.workers), args.out)
 
 
 def _add_compare(subparsers: Subparsers) -> None:
@@ -181,16 +193,7 @@ def _add_compare(subparsers: Subparsers) -> None:
         metavar="NAME",
         help="knntd, exa, sarsa (true online SARSA(λ) with tile coding), and RL Zoo's: dqn, qrdqn, ppo, sac, td3, ...",
     )
-    parser.add_argument(
-        "--seeds", type=positive_int, default=10, metavar="N", help="number of seeds (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--first-seed",
-        type=seed_int,
-        default=1000,
-        metavar="N",
-        help="configurations of this package were tuned on seeds below 1000 (default: %(default)s)",
-    )
+    _add_seeds(parser, 10, "configurations of this package were tuned on seeds below 1000")
     parser.add_argument(
         "--steps",
         type=positive_int,
@@ -259,13 +262,10 @@ def _run_compare(args: argparse.Namespace) -> int:
         require("ray", extra="ray")
     from sb3_knntd.compare.command import Plan, compare
 
-    seeds = range(args.first_seed, args.first_seed + args.seeds)
-    if seeds[-1] >= 2**31:
-        raise CommandError(f"seeds go to 2147483647; got {args.seeds} from {args.first_seed} on")
     plan = Plan(
         list(dict.fromkeys(args.env)),
         list(dict.fromkeys(args.algos)),
-        seeds,
+        _seeds(args),
         args.steps,
         args.defaults,
         {name: Path(path) for name, path in _pairs("--conf", args.conf, "NAME=FILE")},
@@ -275,13 +275,10 @@ def _run_compare(args: argparse.Namespace) -> int:
         args.gym_packages,
         args.out,
     )
-    try:
-        return compare(plan, args.backend, args.workers, args.address, args.cpus_per_run, args.memory_per_run)
-    except KeyboardInterrupt:
-        print(
-            f"\nInterrupted. What is finished is in {args.out}: the same command goes on from there.", file=sys.stderr
-        )
-        return INTERRUPTED
+    return _resumable(
+        lambda: compare(plan, args.backend, args.workers, args.address, args.cpus_per_run, args.memory_per_run),
+        args.out,
+    )
 
 
 def _pairs(option: str, texts: Sequence[str], form: str) -> list[tuple[str, str]]:

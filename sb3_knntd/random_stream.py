@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-#: Rows made at a time; drawing one from NumPy costs more than taking it from a block.
+#: Rows made at a time, as far as these are no more numbers than NUMBERS_PER_BLOCK (8 MiB): drawing one row from NumPy
+#: costs more than taking it from a block.
 ROWS_PER_BLOCK = 1024
+NUMBERS_PER_BLOCK = 2**20
 
 
 class RandomStream:
@@ -21,8 +24,9 @@ class RandomStream:
 
     def __init__(self, shape: tuple[int, ...], purpose: int = 0) -> None:
         self._purpose = purpose
+        n_rows = max(1, min(ROWS_PER_BLOCK, NUMBERS_PER_BLOCK // max(1, math.prod(shape))))
         #: the present block of rows, numbers in [0, 1)
-        self.rows = np.empty((ROWS_PER_BLOCK, *shape))
+        self.rows = np.empty((n_rows, *shape))
         #: how many of them have been taken, shape (1,), int64; a kernel takes them by itself
         self.taken = np.zeros(1, np.int64)
         self.seed(None)
@@ -34,13 +38,15 @@ class RandomStream:
         :param seed: seed, or ``None`` for one from the operating system
         """
         self._key = np.random.SeedSequence(seed, spawn_key=(self._purpose,)).generate_state(2, np.uint64)
-        self._fill(0)
+        # The first block is made when a row is wanted: a stream is often seeded more than once before that.
+        self._number = -1
+        self.taken[0] = len(self.rows)
 
     def next(self) -> np.ndarray:
         """
         :return: the next row, a view that must not be written to and that holds until the next call
         """
-        if self.taken[0] == ROWS_PER_BLOCK:
+        if self.taken[0] == len(self.rows):
             self.refill()
         self.taken[0] += 1
         row: np.ndarray = self.rows[self.taken[0] - 1]
@@ -60,7 +66,7 @@ class RandomStream:
         """
         :return: key and position, plain integers
         """
-        position = self._number * ROWS_PER_BLOCK + int(self.taken[0])
+        position = self._number * len(self.rows) + int(self.taken[0])
         return {"key": [int(word) for word in self._key], "position": position}
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -68,6 +74,6 @@ class RandomStream:
         :param state: what :meth:`state` returned
         """
         self._key = np.array(state["key"], dtype=np.uint64)
-        number, taken = divmod(state["position"], ROWS_PER_BLOCK)
+        number, taken = divmod(state["position"], len(self.rows))
         self._fill(number)
         self.taken[0] = taken

@@ -271,7 +271,7 @@ def test_other_words_are_refused() -> None:
 
 
 def test_beyond_the_space_there_is_nothing_to_follow() -> None:
-    """Noise carries observations past the space's bounds; the table is not carried over for that, at every step anew."""
+    """Noise carries observations past the space's bounds; the table is not carried over for that at every step."""
     model = make_random()
     model.policy.perceiver.measure(th.tensor([[-40.0, -2.0], [40.0, 2.0]]))
     values = model.policy.q_table.clone()

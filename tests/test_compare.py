@@ -253,6 +253,9 @@ def test_configurations_are_the_tuned_ones_or_the_defaults(tmp_path: Path) -> No
         plain = Configuration({"policy": policy}, "the algorithm's defaults")
         assert configuration(algo, "MountainCar-v0", True, {}) == plain
         assert configuration(algo, "compare/Corridor-v0", False, {}) == plain
+    related = configuration("dqn", "sb3_knntd/Acrobot-v0", False, {})
+    assert related == configuration("dqn", "Acrobot-v1", False, {})
+    assert configuration("knntd", "sb3_knntd/Acrobot-v0", False, {}).source.endswith("sb3_knntd/Acrobot-v0")
 
     path = tmp_path / "mine.yml"
     path.write_text(yaml.safe_dump({"default": {"policy": "KNNPolicy", "points": 5}, "CartPole-v1": {"points": 6}}))

@@ -9,10 +9,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_knntd import KNNTD, ExA
+from sb3_knntd.random_stream import RandomStream
 
 Algorithm = type[KNNTD | ExA]
 MakeModel = Callable[..., KNNTD | ExA]
@@ -109,3 +112,25 @@ def test_length_of_the_call_decides_nothing_without_schedules(
     at_once = make_model(make_venv(n_envs), **settings).learn(150)
     in_parts = make_model(make_venv(n_envs), **settings).learn(60).learn(90, reset_num_timesteps=False)
     assert th.equal(at_once.policy.q_table, in_parts.policy.q_table)
+
+
+@given(
+    shape=st.lists(st.integers(1, 4), min_size=1, max_size=3).map(tuple) | st.just((2**18,)),
+    before=st.integers(0, 9),
+    after=st.integers(1, 9),
+    seed=st.integers(0, 2**31 - 1),
+)
+@settings(max_examples=25, deadline=None)
+def test_a_stream_goes_on_from_a_saved_position(shape: tuple[int, ...], before: int, after: int, seed: int) -> None:
+    """Whatever the width of its rows, which says how many of them are made at a time."""
+    stream, other = RandomStream(shape), RandomStream(shape)
+    stream.seed(seed)
+    for _ in range(before):
+        stream.next()
+    other.set_state(stream.state())
+    for _ in range(after):
+        row = stream.next().copy()
+        assert row.shape == shape
+        np.testing.assert_array_equal(other.next(), row)
+    assert stream.state() == other.state() == {"key": stream.state()["key"], "position": before + after}
+    assert stream.rows.nbytes <= max(8 * 2**20, row.nbytes)

@@ -422,8 +422,14 @@ def test_noise_on_angles_goes_round() -> None:
 
 
 def test_registration() -> None:
-    for name, steps in ((CAR, 1000), (POLE, 1000), (CONTINUOUS, 1000), (ACROBOT, 500)):
-        assert gym.spec(name).max_episode_steps == steps
+    for name, steps, solved in (
+        (CAR, 1000, -110),
+        (POLE, 1000, 8000),
+        (CONTINUOUS, 1000, 8000),
+        (ACROBOT, 500, -100),
+    ):
+        spec = gym.spec(name)
+        assert (spec.max_episode_steps, spec.reward_threshold) == (steps, solved)
     assert sb3_knntd.envs.MountainCarEnv is type(make(CAR))
     env = gym.make(ACROBOT)
     env.reset()

@@ -30,6 +30,13 @@ ACTIONS: dict[str, type[spaces.Space[Any]]] = {
     **dict.fromkeys(("knntd", "sarsa", "dqn", "qrdqn"), spaces.Discrete),
     **dict.fromkeys(("exa", "sac", "td3", "tqc", "ddpg", "crossq"), spaces.Box),
 }
+#: Problems of gymnasium that environments of this package are forms of: what was tuned for those is good for these.
+RELATED = {
+    "sb3_knntd/MountainCar-v0": "MountainCar-v0",
+    "sb3_knntd/GeneralizedMountainCar-v0": "MountainCar-v0",
+    "sb3_knntd/CartPole-v0": "CartPole-v1",
+    "sb3_knntd/Acrobot-v0": "Acrobot-v1",
+}
 #: Entries of a configuration that only say how long RL Zoo trains.
 DURATION = "n_timesteps"
 
@@ -69,8 +76,8 @@ def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Pat
     :param env_id: environment
     :param defaults: whether it is to have its own defaults
     :param conf: by algorithm, a file in RL Zoo's form that is to be taken instead
-    :return: the entry of the environment in that file, or in RL Zoo's or this package's own, else the entry
-        ``default`` there, else the algorithm's defaults
+    :return: the entry of the environment in that file, or in RL Zoo's or this package's own, else the entry of the
+        environment it is a form of (:data:`RELATED`), else the entry ``default`` there, else the algorithm's defaults
     :raises ValueError: if a file that was named has neither entry, or is none in RL Zoo's form
     :raises OSError: if it cannot be read
     """
@@ -86,7 +93,7 @@ def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Pat
     entries = yaml.safe_load(path.read_text(encoding="utf-8"))
     if not isinstance(entries, dict):
         raise ValueError(f"{path} must have an entry for each environment, as RL Zoo's files do")
-    for entry in (env_id, "default"):
+    for entry in (env_id, RELATED.get(env_id, env_id), "default"):
         if entry in entries:
             found = json.loads(json.dumps(entries[entry]))
             steps = found.pop(DURATION, None)

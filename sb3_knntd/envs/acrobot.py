@@ -140,6 +140,8 @@ class AcrobotEnv(PaperEnv["int | np.integer[Any]"]):
     | `"step"` (default) | -1        | 0                    |
     | `"goal"`           | 0         | 1                    |
 
+    The `reward_threshold` is that of gymnasium's Acrobot, a mean return of -100 with `"step"`.
+
     ## Starting State
 
     | `start`             | state                                    |

@@ -224,6 +224,7 @@ class CartPoleEnv(_CartPoleEnv["int | np.integer[Any]"]):
 
     where *upright* = 10 - 10 (10 |angle|)² - 5 |position| - 10 |angular velocity| and
     *fallen* = -10000 - 50 |position| - 100 |angle|, both of the state after the step.
+    The `reward_threshold` is a mean return of 8000 with `"shaped"`, of at most 10,000.
 
     ## Starting State
 

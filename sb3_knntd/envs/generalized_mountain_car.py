@@ -132,6 +132,7 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
     ## Rewards
 
     -1 a step, and 0 for the step that reaches the goal, which `sb3_knntd/MountainCar-v0` rewards with -1 as well.
+    The `reward_threshold` is a mean return of -150.
 
     ## Starting State
 

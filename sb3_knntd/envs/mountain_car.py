@@ -83,6 +83,8 @@ class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
     | `"step"` (default) | -1        | -1                   |
     | `"goal"`           | 0         | 1                    |
 
+    The `reward_threshold` is that of gymnasium's Mountain-Car, a mean return of -110 with `"step"`.
+
     ## Starting State
 
     | `start`             | position                | velocity                 |

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd import KNNTD, ExA
 from sb3_knntd.zoo.schedules import with_schedules
-from sb3_knntd.zoo.search_space import OBS_DIM
+from sb3_knntd.zoo.search_space import attributes, study_values, within
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"knntd": KNNTD, "exa": ExA}
 
@@ -36,7 +36,8 @@ class KNNExperimentManager(ExperimentManager):
     * takes its configuration from ``sb3_knntd.zoo_configs``,
     * reads schedules of all its arguments (:mod:`sb3_knntd.zoo.schedules`),
     * runs on the CPU, where the step is compiled, unless another device is named,
-    * goes on training (``-i``) with the points and neighbours that the saved model has.
+    * goes on training (``-i``) with the points and neighbours that the saved model has,
+    * tries the configuration itself among the first trials of a study, so that no study ends worse than it began.
 
     With the algorithms of RL Zoo it is RL Zoo's.
 
@@ -89,9 +90,17 @@ class KNNExperimentManager(ExperimentManager):
         :param trial: trial of a study
         :return: mean return of the last evaluation
         """
-        if self._is_ours:
-            trial.set_user_attr(OBS_DIM, self.obs_dim)
-        return super().objective(trial)
+        if not self._is_ours:
+            return super().objective(trial)
+        for name, value in attributes(self.obs_dim, self._hyperparams).items():
+            trial.set_user_attr(name, value)
+        try:
+            return super().objective(trial)
+        finally:
+            # Only now is it known what is searched. Of several workers one has the first trial.
+            if trial.number == 0:
+                configured = study_values(ALGORITHMS[self.algo], self._hyperparams)
+                trial.study.enqueue_trial(within(configured, trial.distributions))
 
 
 def make_tables(url: str) -> None:

@@ -3,14 +3,23 @@ What ``train --optimize`` searches: for each algorithm a sampler, and a converte
 
 A study holds plain numbers and words. Most are on a log scale: 1 - γ and 1 - λ rather than γ and λ, points in a
 dimension, and the bandwidth in spacings of the lattice, so that it means the same on any lattice.
+
+Points that a configuration gives for each dimension are knowledge of the problem, which a study keeps; likewise action
+points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import optuna
+from optuna.distributions import BaseDistribution, CategoricalDistribution
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_knntd.zoo.schedules import with_schedules
 
@@ -19,6 +28,12 @@ Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], Params]
 
 #: Attribute of a trial: number of observation dimensions, 0 for finite states, which have no lattice.
 OBS_DIM = "obs_dim"
+
+#: Attribute of a trial: number of points in all, if the configuration gives them for each dimension, otherwise 0.
+KEPT_POINTS = "kept_points"
+
+#: Attribute of a trial: whether the configuration gives the action points for each dimension.
+KEEPS_ACTION_POINTS = "keeps_action_points"
 
 #: Lattices are searched up to about so many points in all, with at most so many in a dimension.
 MOST_POINTS = 20_000
@@ -29,7 +44,7 @@ def sample_knntd_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    :param trial: trial with the user attribute ``"obs_dim"``
+    :param trial: trial with what :func:`attributes` says
     :param n_actions: not used
     :param n_envs: not used
     :param additional_args: not used
@@ -38,8 +53,6 @@ def sample_knntd_params(
     params = _sample_common(trial)
     params["target"] = trial.suggest_categorical("target", ["sarsa", "q_learning", "expected_sarsa"])
     params["exploration"] = trial.suggest_categorical("exploration", ["epsilon_greedy", "softmax"])
-    params["exploration_initial_eps"] = trial.suggest_float("exploration_initial_eps", 0.01, 1.0, log=True)
-    params["exploration_fraction"] = trial.suggest_float("exploration_fraction", 0.1, 1.0)
     params["initial_temperature"] = trial.suggest_float("initial_temperature", 0.01, 100.0, log=True)
     return _arguments(trial, convert_knntd_params(params))
 
@@ -60,18 +73,17 @@ def sample_exa_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    :param trial: trial with the user attribute ``"obs_dim"``
+    :param trial: trial with what :func:`attributes` says
     :param n_actions: not used
     :param n_envs: not used
     :param additional_args: not used
     :return: arguments of :class:`~sb3_knntd.ExA`
     """
     params = _sample_common(trial)
-    params["action_points"] = trial.suggest_int("action_points", 2, 15, log=True)
+    if not trial.user_attrs[KEEPS_ACTION_POINTS]:
+        params["action_points"] = trial.suggest_int("action_points", 2, 15, log=True)
     params["exploration"] = trial.suggest_categorical("exploration", ["shared", "per_neighbor"])
     params["exploration_hold"] = trial.suggest_float("exploration_hold", 1.0, 50.0, log=True)
-    params["exploration_initial_eps"] = trial.suggest_float("exploration_initial_eps", 0.05, 1.0, log=True)
-    params["exploration_fraction"] = trial.suggest_float("exploration_fraction", 0.1, 1.0)
     return _arguments(trial, convert_exa_params(params))
 
 
@@ -87,26 +99,37 @@ def _sample_common(trial: optuna.Trial) -> Params:
     """What both algorithms have. Every value is asked for in every trial, as multivariate samplers need it."""
     params: Params = {
         "initial_learning_rate": trial.suggest_float("initial_learning_rate", 0.05, 1.0, log=True),
+        "final_learning_rate_share": trial.suggest_float("final_learning_rate_share", 0.01, 1.0, log=True),
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.03, log=True),
         "one_minus_trace_decay": trial.suggest_float("one_minus_trace_decay", 0.01, 1.0, log=True),
         "traces": trial.suggest_categorical("traces", ["replacing", "accumulating"]),
         "initial_value_sign": trial.suggest_categorical("initial_value_sign", [-1, 0, 1]),
         "initial_value_size": trial.suggest_float("initial_value_size", 0.1, 1000.0, log=True),
+        # From next to nothing: where rewards are negative, a table of zeros explores by itself.
+        "exploration_initial_eps": trial.suggest_float("exploration_initial_eps", 0.001, 1.0, log=True),
+        "exploration_fraction": trial.suggest_float("exploration_fraction", 0.1, 1.0),
     }
     obs_dim: int = trial.user_attrs[OBS_DIM]
-    if obs_dim:
+    kept_points: int = trial.user_attrs[KEPT_POINTS]
+    if kept_points:
+        params["bandwidth"] = trial.suggest_float("bandwidth", 0.05, 2.0, log=True)
+        most_neighbors = kept_points
+    elif obs_dim:
         most = max(3, min(MOST_POINTS_PER_DIMENSION, int(MOST_POINTS ** (1 / obs_dim))))
         fewest = min(5, most - 1)
         params["points_per_dimension"] = trial.suggest_int("points_per_dimension", fewest, most, log=True)
-        params["n_neighbors"] = trial.suggest_int("n_neighbors", 1, min(8 * obs_dim, fewest**obs_dim), log=True)
-        params["weights"] = trial.suggest_categorical("weights", ["inverse_quadratic", "gaussian"])
         params["bandwidth_in_spacings"] = trial.suggest_float("bandwidth_in_spacings", 0.5, 10.0, log=True)
+        most_neighbors = fewest**obs_dim
+    if obs_dim:
+        params["n_neighbors"] = trial.suggest_int("n_neighbors", 1, min(8 * obs_dim, most_neighbors), log=True)
+        params["weights"] = trial.suggest_categorical("weights", ["inverse_quadratic", "gaussian"])
     return params
 
 
 def _convert_common(sampled_params: Params) -> Params:
     params = dict(sampled_params)
-    params["learning_rate"] = f"lin_{params.pop('initial_learning_rate')}"
+    learning_rate = params.pop("initial_learning_rate")
+    params["learning_rate"] = f"lin_{learning_rate}_{learning_rate * params.pop('final_learning_rate_share'):.3g}"
     params["gamma"] = 1 - params.pop("one_minus_gamma")
     params["trace_decay"] = 1 - params.pop("one_minus_trace_decay")
     params["initial_value"] = params.pop("initial_value_sign") * params.pop("initial_value_size")
@@ -115,6 +138,76 @@ def _convert_common(sampled_params: Params) -> Params:
         # In scaled units a lattice is 2 wide.
         params["bandwidth"] = params.pop("bandwidth_in_spacings") * 2 / (params["points"] - 1)
     return params
+
+
+def attributes(obs_dim: int, configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param obs_dim: number of observation dimensions, 0 for finite states
+    :param configuration: arguments of the algorithm
+    :return: what a trial's user attributes must say for a sampler
+    """
+    points = configuration.get("points", "auto")
+    n_points = 0
+    if np.ndim(points) == 1:
+        n_points = math.prod(points)
+    elif np.ndim(points) == 2:
+        n_points = len(points)
+    return {
+        OBS_DIM: obs_dim,
+        KEPT_POINTS: n_points,
+        KEEPS_ACTION_POINTS: isinstance(configuration.get("action_points"), list),
+    }
+
+
+def study_values(algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any]) -> Params:
+    """
+    The inverse of a converter.
+
+    :param algorithm: :class:`~sb3_knntd.KNNTD` or :class:`~sb3_knntd.ExA`
+    :param configuration: arguments of the algorithm, schedules as functions; its defaults for those that are not there
+    :return: values of a study, as far as a study has values for them
+    """
+    defaults = {name: parameter.default for name, parameter in inspect.signature(algorithm).parameters.items()}
+    values = defaults | dict(configuration)
+    rate = values["learning_rate"]
+    if isinstance(rate, LinearSchedule):
+        values |= {
+            "initial_learning_rate": rate.start,
+            "final_learning_rate_share": rate.end / rate.start if rate.start else 1.0,
+        }
+    else:
+        values |= {"initial_learning_rate": rate, "final_learning_rate_share": 1.0}
+    values["one_minus_gamma"] = 1 - values["gamma"]
+    if isinstance(values["trace_decay"], float | int):
+        values["one_minus_trace_decay"] = 1 - values["trace_decay"]
+    values |= {
+        "initial_value_sign": int(np.sign(values["initial_value"])),
+        "initial_value_size": abs(values["initial_value"]),
+    }
+    if isinstance(values["points"], int):
+        values["points_per_dimension"] = values["points"]
+        values["bandwidth_in_spacings"] = values["bandwidth"] * (values["points"] - 1) / 2
+    if "temperature" in values:
+        temperature = values["temperature"]
+        values["initial_temperature"] = temperature.start if isinstance(temperature, LinearSchedule) else temperature
+    return values
+
+
+def within(values: Params, distributions: Mapping[str, BaseDistribution]) -> Params:
+    """
+    :param values: values of a study, and others
+    :param distributions: what the study searches
+    :return: those of the values that it searches, numbers moved into its ranges; without words it does not know
+    """
+    inside: Params = {}
+    for name, distribution in distributions.items():
+        value = values.get(name)
+        if isinstance(distribution, CategoricalDistribution):
+            if value in distribution.choices:
+                inside[name] = value
+        elif isinstance(value, float | int):
+            inside[name] = min(max(value, distribution.low), distribution.high)  # type: ignore[attr-defined]
+    return inside
 
 
 def _arguments(trial: optuna.Trial, params: Params) -> Params:
