@@ -18,6 +18,7 @@ import pytest
 import yaml
 from gymnasium import spaces
 from matplotlib import pyplot as plt
+from optuna.samplers import BaseSampler, RandomSampler
 from sqlalchemy.exc import IntegrityError, OperationalError
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
@@ -29,8 +30,9 @@ import sb3_knntd.cli
 from sb3_knntd import KNNTD, ExA
 from sb3_knntd.cli import main
 from sb3_knntd.zoo import experiment, register
+from sb3_knntd.zoo.configuration_first import ConfigurationFirst
 from sb3_knntd.zoo.schedules import parse_schedule, with_schedules
-from sb3_knntd.zoo.search_space import CONVERTERS, OBS_DIM, SAMPLERS
+from sb3_knntd.zoo.search_space import CONVERTERS, OBS_DIM, SAMPLERS, attributes, study_values
 
 # SB3 silences the one when it is imported, which pytest undoes; the other is RL Zoo's word on an unnamed study.
 pytestmark = [
@@ -292,6 +294,18 @@ def make_env(algo: str, obs_dim: int) -> gym.Env[Any, Any]:
     return env
 
 
+def with_attributes(trial: Any, obs_dim: int, configuration: dict[str, Any]) -> Any:
+    for name, value in attributes(obs_dim, configuration).items():
+        trial.set_user_attr(name, value)
+    return trial
+
+
+def asked(obs_dim: int, configuration: dict[str, Any], sampler: BaseSampler | None = None) -> Any:
+    """The first trial of a study."""
+    study = optuna.create_study(sampler=sampler or RandomSampler(seed=0))
+    return with_attributes(study.ask(), obs_dim, configuration)
+
+
 def ends(distribution: Any) -> tuple[Any, Any]:
     choices = getattr(distribution, "choices", None)
     return (choices[0], choices[-1]) if choices else (distribution.low, distribution.high)
@@ -300,17 +314,13 @@ def ends(distribution: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("algo", ["knntd", "exa"])
 @pytest.mark.parametrize("obs_dim", [0, 1, 2, 4, 6, 17])
 def test_search_space(algo: str, obs_dim: int) -> None:
-    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    trial = study.ask()
-    trial.set_user_attr(OBS_DIM, obs_dim)
+    trial = asked(obs_dim, {})
     SAMPLERS[algo](trial, 0, 1, {})
     assert ("points_per_dimension" in trial.params) == (obs_dim > 0)
     # The corners of what is searched, and what was drawn.
     distributions = trial.distributions.items()
     for params in (trial.params, *({name: ends(d)[end] for name, d in distributions} for end in (0, 1))):
-        fixed = optuna.trial.FixedTrial(params)
-        fixed.set_user_attr(OBS_DIM, obs_dim)
-        arguments = SAMPLERS[algo](fixed, 0, 1, {})  # type: ignore[arg-type]
+        arguments = SAMPLERS[algo](with_attributes(optuna.trial.FixedTrial(params), obs_dim, {}), 0, 1, {})
         converted = CONVERTERS[algo](json.loads(json.dumps(params)))
         assert json.loads(json.dumps(converted)) == converted
         assert arguments.keys() == converted.keys()
@@ -319,10 +329,54 @@ def test_search_space(algo: str, obs_dim: int) -> None:
         for name, value in arguments.items():
             assert getattr(model, name) == value
         assert model.lr_schedule(1.0) == params["initial_learning_rate"]
+        final = params["initial_learning_rate"] * params["final_learning_rate_share"]
+        assert model.lr_schedule(0.0) == pytest.approx(final, rel=0.01)
         if obs_dim:
             spacing = 2 / (params["points_per_dimension"] - 1)
             assert model.bandwidth == pytest.approx(params["bandwidth_in_spacings"] * spacing)
             assert model.policy.perceiver.points.n_points <= max(30_000, 3**obs_dim)
+
+
+@pytest.mark.parametrize("algo", ["knntd", "exa"])
+@pytest.mark.parametrize(("points", "most_neighbors"), [([4, 6], 16), ([2, 3], 6), ([[0.0, 0.0], [1.0, 1.0]], 2)])
+def test_a_study_keeps_the_points_of_each_dimension(algo: str, points: list[Any], most_neighbors: int) -> None:
+    configuration = {"points": points, "action_points": [[-1.0, 1.0], [-1.0, 0.0, 1.0]]}
+    trial = asked(2, configuration)
+    arguments = SAMPLERS[algo](trial, 0, 1, {})
+    assert not {"points", "action_points"} & arguments.keys()
+    assert trial.distributions["n_neighbors"].high == most_neighbors
+    assert arguments["bandwidth"] == trial.params["bandwidth"]
+    # One number for all dimensions is no such knowledge.
+    assert {"points"} < SAMPLERS[algo](asked(2, {"points": 5, "action_points": 3}), 0, 1, {}).keys()
+
+
+@pytest.mark.parametrize("algo", ["knntd", "exa"])
+@pytest.mark.parametrize("given", [{}, {"points": [5, 6]}])
+def test_the_first_trial_is_the_configurations(algo: str, given: dict[str, Any]) -> None:
+    configuration = given | SAMPLERS[algo](asked(2, given), 0, 1, {})
+    first = ConfigurationFirst(RandomSampler(seed=1), study_values(ALGORITHMS[algo], configuration))
+    arguments = given | SAMPLERS[algo](asked(2, given, first), 0, 1, {})
+    assert arguments.keys() == configuration.keys()
+    for name, value in arguments.items():
+        if isinstance(value, LinearSchedule):
+            given_schedule = configuration[name]
+            assert (value.start, value.end) == pytest.approx((given_schedule.start, given_schedule.end), rel=0.01)
+        else:
+            number = isinstance(value, float)
+            assert value == (pytest.approx(configuration[name]) if number else configuration[name]), name
+
+
+def test_the_first_trial_where_the_configuration_is_not_in_the_search_space() -> None:
+    settings = {"learning_rate": 0.4, "gamma": 1.0, "exploration_initial_eps": 0.0, "exploration": "unheard-of"}
+    study = optuna.create_study(sampler=ConfigurationFirst(RandomSampler(seed=0), study_values(KNNTD, settings)))
+    first, second = (with_attributes(study.ask(), 2, settings) for _ in range(2))
+    for trial in (first, second):
+        SAMPLERS["knntd"](trial, 0, 1, {})
+    assert (first.params["initial_learning_rate"], first.params["final_learning_rate_share"]) == (0.4, 1.0)
+    assert (first.params["one_minus_gamma"], first.params["exploration_initial_eps"]) == (0.0001, 0.001)
+    assert (first.params["target"], first.params["exploration_fraction"]) == ("sarsa", 0.5)
+    assert first.params.keys() == second.params.keys()
+    assert second.params["initial_learning_rate"] != 0.4
 
 
 def test_optimize_exa_and_train_with_a_trial(tmp_path: Path) -> None:
@@ -335,11 +389,15 @@ def test_optimize_exa_and_train_with_a_trial(tmp_path: Path) -> None:
     assert all(trial.value is not None and -2000 < trial.value < 0 for trial in study.trials)
     trial = study.trials[1]
     assert trial.user_attrs[OBS_DIM] == 3
+    settings = yaml.safe_load((Path(__file__).parent.parent / "zoo_configs" / "exa.yml").read_text())["Pendulum-v1"]
+    assert study.trials[0].params["initial_value_size"] == abs(settings["initial_value"])
+    assert study.trials[0].params["bandwidth"] == settings["bandwidth"]
     options = ["-n", 100, "--eval-freq", -1, *study_options, "--trial-id", 1]
     (report,) = (tmp_path / "exa").glob("report_*.csv")
     assert report.is_file()
     model = saved_model("exa", train(tmp_path / "best", "exa", "Pendulum-v1", *options))
-    assert model.points == trial.params["points_per_dimension"]
+    assert model.points == settings["points"]
+    assert model.bandwidth == trial.params["bandwidth"]
     assert model.gamma == 1 - trial.params["one_minus_gamma"] == trial.user_attrs["gamma"]
     assert model.lr_schedule(1.0) == trial.params["initial_learning_rate"]
 

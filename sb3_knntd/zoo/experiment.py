@@ -9,14 +9,16 @@ from typing import Any
 
 import optuna
 from gymnasium import spaces
+from optuna.samplers import BaseSampler
 from rl_zoo3.exp_manager import ExperimentManager
 from sqlalchemy.exc import DBAPIError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd import KNNTD, ExA
+from sb3_knntd.zoo.configuration_first import ConfigurationFirst
 from sb3_knntd.zoo.schedules import with_schedules
-from sb3_knntd.zoo.search_space import attributes, study_values, within
+from sb3_knntd.zoo.search_space import attributes, study_values
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"knntd": KNNTD, "exa": ExA}
 
@@ -37,7 +39,7 @@ class KNNExperimentManager(ExperimentManager):
     * reads schedules of all its arguments (:mod:`sb3_knntd.zoo.schedules`),
     * runs on the CPU, where the step is compiled, unless another device is named,
     * goes on training (``-i``) with the points and neighbours that the saved model has,
-    * tries the configuration itself among the first trials of a study, so that no study ends worse than it began.
+    * tries the configuration itself first in a study.
 
     With the algorithms of RL Zoo it is RL Zoo's.
 
@@ -79,6 +81,12 @@ class KNNExperimentManager(ExperimentManager):
             hyperparams = {name: value for name, value in hyperparams.items() if name not in SHAPE}
         return super()._load_pretrained_agent(hyperparams, env)
 
+    def _create_sampler(self, sampler_method: str) -> BaseSampler:
+        sampler = super()._create_sampler(sampler_method)
+        if not self._is_ours:
+            return sampler
+        return ConfigurationFirst(sampler, study_values(ALGORITHMS[self.algo], self._hyperparams))
+
     def hyperparameters_optimization(self) -> None:
         """Search hyperparameters, alone or as one of several workers on a study."""
         if self.storage is not None and not self.storage.endswith(".log"):
@@ -94,13 +102,7 @@ class KNNExperimentManager(ExperimentManager):
             return super().objective(trial)
         for name, value in attributes(self.obs_dim, self._hyperparams).items():
             trial.set_user_attr(name, value)
-        try:
-            return super().objective(trial)
-        finally:
-            # Only now is it known what is searched. Of several workers one has the first trial.
-            if trial.number == 0:
-                configured = study_values(ALGORITHMS[self.algo], self._hyperparams)
-                trial.study.enqueue_trial(within(configured, trial.distributions))
+        return super().objective(trial)
 
 
 def make_tables(url: str) -> None:

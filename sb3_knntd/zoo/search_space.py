@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import optuna
-from optuna.distributions import BaseDistribution, CategoricalDistribution
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -191,23 +190,6 @@ def study_values(algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any
         temperature = values["temperature"]
         values["initial_temperature"] = temperature.start if isinstance(temperature, LinearSchedule) else temperature
     return values
-
-
-def within(values: Params, distributions: Mapping[str, BaseDistribution]) -> Params:
-    """
-    :param values: values of a study, and others
-    :param distributions: what the study searches
-    :return: those of the values that it searches, numbers moved into its ranges; without words it does not know
-    """
-    inside: Params = {}
-    for name, distribution in distributions.items():
-        value = values.get(name)
-        if isinstance(distribution, CategoricalDistribution):
-            if value in distribution.choices:
-                inside[name] = value
-        elif isinstance(value, float | int):
-            inside[name] = min(max(value, distribution.low), distribution.high)  # type: ignore[attr-defined]
-    return inside
 
 
 def _arguments(trial: optuna.Trial, params: Params) -> Params:
