@@ -410,6 +410,23 @@ def test_optimize_finite_states_with_other_sampler_and_pruner(
     assert "Number of finished trials:  2" in capsys.readouterr().out
 
 
+def test_a_trial_that_diverges_does_not_end_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learn, calls = KNNTD.learn, iter(range(2))
+
+    def diverging_at_first(model: KNNTD, *arguments: Any, **options: Any) -> KNNTD:
+        if next(calls) == 0:
+            raise FloatingPointError("the action values have diverged")
+        return learn(model, *arguments, **options)
+
+    monkeypatch.setattr(KNNTD, "learn", diverging_at_first)
+    storage = tmp_path / "study.log"
+    options = ["--n-trials", 2, "--storage", storage, "--study-name", "diverging"]
+    zoo("train", "--algo", "knntd", "--env", "MountainCar-v0", "-f", tmp_path, *OPTIMIZE, *options)
+    backend = optuna.storages.journal.JournalFileBackend(str(storage))
+    study = optuna.load_study(study_name="diverging", storage=optuna.storages.JournalStorage(backend))
+    assert [trial.state.name for trial in study.trials] == ["PRUNED", "COMPLETE"]
+
+
 def test_two_processes_on_one_study(tmp_path: Path) -> None:
     options = ["--storage", "study.log", "--study-name", "two", "--n-trials", "2", "--n-startup-trials", "1"]
     command = [*COMMAND, "train", "--algo", "knntd", "--env", "MountainCar-v0", *OPTIMIZE, *options]

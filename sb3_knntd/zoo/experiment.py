@@ -97,12 +97,18 @@ class KNNExperimentManager(ExperimentManager):
         """
         :param trial: trial of a study
         :return: mean return of the last evaluation
+        :raises optuna.TrialPruned: if others were better so far, or action values diverge
         """
         if not self._is_ours:
             return super().objective(trial)
         for name, value in attributes(self.obs_dim, self._hyperparams).items():
             trial.set_user_attr(name, value)
-        return super().objective(trial)
+        try:
+            return super().objective(trial)
+        except FloatingPointError as error:
+            # As RL Zoo does with the errors that networks raise for it.
+            print(error)
+            raise optuna.TrialPruned from error
 
 
 def make_tables(url: str) -> None:
