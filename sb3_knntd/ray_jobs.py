@@ -52,24 +52,42 @@ def compute_on_ray(job: Job, board: Any) -> Outcome:
     return compute(job)
 
 
-@contextmanager
-def connected(address: str | None = None) -> Iterator[None]:
+def connect(address: str | None = None, log_to_driver: bool = False) -> bool:
     """
-    Be connected to a cluster; whoever is already stays so.
+    Connect this process to a cluster; whoever is connected already stays so.
 
     :param address: ``"auto"`` for the cluster that this machine belongs to, ``"ray://host:port"`` for one elsewhere,
-        ``None`` for that of ``RAY_ADDRESS``, or else one of this machine alone, for as long as this lasts
+        ``None`` for that of ``RAY_ADDRESS``, or else one of this machine alone
+    :param log_to_driver: whether what is printed elsewhere is shown here
+    :return: whether it was not connected before
     :raises ConnectionError: if there is no such cluster
     """
     if ray.is_initialized():
-        yield
-        return
+        return False
     is_there = address or os.environ.get("RAY_ADDRESS")
-    ray.init(address, include_dashboard=None if is_there else False, log_to_driver=False, logging_level=logging.WARNING)
+    ray.init(
+        address,
+        include_dashboard=None if is_there else False,
+        log_to_driver=log_to_driver,
+        logging_level=logging.WARNING,
+    )
+    return True
+
+
+@contextmanager
+def connected(address: str | None = None) -> Iterator[None]:
+    """
+    Be connected to a cluster for as long as this lasts; whoever is connected already stays so.
+
+    :param address: as :func:`connect` takes it
+    :raises ConnectionError: if there is no such cluster
+    """
+    is_ours = connect(address)
     try:
         yield
     finally:
-        ray.shutdown()
+        if is_ours:
+            ray.shutdown()
 
 
 def run_on_ray(

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -18,36 +16,20 @@ from typing import Any
 import job_functions
 import pytest
 import ray
-from ray._private import ray_constants
 from ray.cluster_utils import Cluster
 from ray.util.client.server.server import serve
+from ray_cluster import NODE, TESTS, loopback_cluster
 
 from sb3_knntd.cli import main
 from sb3_knntd.jobs import Job, run_jobs
 from sb3_knntd.ray_jobs import connected, run_on_ray
 
-TESTS = str(Path(__file__).parent)
-
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A head that computes nothing, and a node; this process is connected."""
-    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # sockets have short names
-    node = {"node_ip_address": "127.0.0.1", "object_store_memory": 80 * 2**20}
-    head = {**node, "num_cpus": 0, "include_dashboard": False, "temp_dir": folder}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        # Where clusters are not meant for several machines, Ray keeps to the loopback address.
-        patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
-        made = Cluster(initialize_head=True, head_node_args=head)
-        made.add_node(num_cpus=1, **node)
-        ray.init(
-            made.address, runtime_env={"env_vars": {"PYTHONPATH": TESTS}}, log_to_driver=False, logging_level="error"
-        )
+    with loopback_cluster(num_cpus=1) as made:
         yield made
-        ray.shutdown()
-        made.shutdown()
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def wait_until(condition: Any, seconds: float = 90.0) -> None:
@@ -60,7 +42,7 @@ def wait_until(condition: Any, seconds: float = 90.0) -> None:
 def test_a_node_that_dies_costs_nothing(cluster: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     pids = tmp_path / "pids"
     pids.mkdir()
-    doomed = cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1", object_store_memory=80 * 2**20)
+    doomed = cluster.add_node(num_cpus=1, **NODE)
     jobs = [
         *(Job(f"slow-{n}", job_functions.slow, {"seconds": 3, "folder": str(pids)}) for n in range(2)),
         Job("raises", job_functions.fail, {"what": "such thing"}),
