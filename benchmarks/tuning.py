@@ -2,7 +2,7 @@
 The second look at a study: its best trials and the present configuration, each trained with several seeds.
 
     python -m benchmarks.tuning --algo knntd --env Acrobot-v1 --storage studies/acrobot.log --study-name acrobot
-                                [--best N] [--seeds N] [--first-seed 50] [--workers N] [--runs FOLDER]
+                                [--best N] [--seeds N] [--first-seed 50] [--episodes N] [--workers N] [--runs FOLDER]
 
 A study judges a trial by one training and the last evaluation. Here the best of them, their values rounded to two
 digits, are trained as ``python -m benchmarks.zoo`` does it, which also says what is needed. The best by the mean is
@@ -21,7 +21,7 @@ import numpy as np
 import optuna
 import yaml
 
-from benchmarks.zoo import ALGORITHMS, configurations, jobs
+from benchmarks.zoo import ALGORITHMS, EPISODES, configurations, jobs
 from sb3_knntd.jobs import Job, run_jobs
 from sb3_knntd.zoo import register
 from sb3_knntd.zoo.search_space import CONVERTERS
@@ -65,6 +65,9 @@ def main() -> None:
     parser.add_argument("--best", type=int, default=5, help="number of trials")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds for each")
     parser.add_argument("--first-seed", type=int, default=50)
+    parser.add_argument(
+        "--episodes", type=int, default=EPISODES, help="of evaluation; few do where all starts are the same"
+    )
     parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
     parser.add_argument("--runs", type=Path, default=Path("logs/tuning"), help="folder where runs are kept")
     arguments = parser.parse_args()
@@ -81,7 +84,10 @@ def main() -> None:
     tried = candidates(algo, configurations()[algo, env_id], study, arguments.best)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     wanted = {
-        name: [Job(f"{name}-{job.key}", job.function, job.arguments) for job in jobs(algo, env_id, settings, seeds)]
+        name: [
+            Job(f"{name}-{job.key}", job.function, {**job.arguments, "episodes": arguments.episodes})
+            for job in jobs(algo, env_id, settings, seeds)
+        ]
         for name, settings in tried.items()
     }
     runs = arguments.runs / arguments.study_name
