@@ -65,9 +65,7 @@ def main() -> None:
     parser.add_argument("--best", type=int, default=5, help="number of trials")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds for each")
     parser.add_argument("--first-seed", type=int, default=50)
-    parser.add_argument(
-        "--episodes", type=int, default=EPISODES, help="of evaluation; few do where all starts are the same"
-    )
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="few do where all starts are alike")
     parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
     parser.add_argument("--runs", type=Path, default=Path("logs/tuning"), help="folder where runs are kept")
     arguments = parser.parse_args()
