@@ -107,14 +107,15 @@ class EnvActor:
         :param options: the environment's own
         :return: the first observation and its info
         """
-        return self.env.reset(seed=seed, **({"options": options} if options else {}))
+        observation, self.reset_info = self.env.reset(seed=seed, **({"options": options} if options else {}))
+        return observation, self.reset_info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, dict[str, Any], dict[str, Any]]:
         """
         Make a step, and begin the next episode if this one is over.
 
         :param action: the environment's
-        :return: observation, reward, whether the episode is over, info, and info of the last reset in a step
+        :return: observation, reward, whether the episode is over, info, and info of the last reset
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         info["TimeLimit.truncated"] = truncated and not terminated
@@ -179,8 +180,7 @@ class EnvActor:
 class RayVecEnv(VecEnv):
     """
     SB3's SubprocVecEnv over a Ray cluster: each environment is in a process of its own, on any of its machines. It is
-    for simulators that take milliseconds a step or more. With the same seeds it returns what SubprocVecEnv and
-    DummyVecEnv do.
+    for simulators that take milliseconds a step or more. With the same seeds it returns what SubprocVecEnv returns.
 
     It uses the Ray that this process is connected to, and connects it if it is not; the connection then stays until the
     program ends or calls ``ray.shutdown()``. What the environments need must be installed on all machines.
@@ -253,8 +253,8 @@ class RayVecEnv(VecEnv):
             "max_task_retries": 0,
         }
         self._actor_class = ray.remote(EnvActor).options(**options)
-        hidden = SETTLED - {"num_cpus"} | {"runtime_env"}
-        self._asked_for = {key: value for key, value in options.items() if key not in hidden}
+        asked_for = {"num_cpus": num_cpus, **(actor_options or {})}
+        self._asked_for = {key: value for key, value in asked_for.items() if key != "runtime_env"}
 
         #: how often each environment was made anew, shape (n_envs,)
         self.restarts = [0] * n_envs
@@ -504,11 +504,11 @@ class RayVecEnv(VecEnv):
         ready: dict[ray.ObjectRef[Any], int] = {self._actors[index].__ray_ready__.remote(): index for index in indices}
         _, without = ray.wait(list(ready), num_returns=len(ready), timeout=min(PATIENCE, self.placement_timeout))
         if without and self.placement_timeout > PATIENCE:
-            warnings.warn(f"waiting for {self._need(len(without))}", stacklevel=2)
+            warnings.warn(f"still waiting for {self._need(len(without))}", stacklevel=2)
             _, without = ray.wait(without, num_returns=len(without), timeout=self.placement_timeout - PATIENCE)
         if without:
             raise TimeoutError(
-                f"in {self.placement_timeout:g} s (placement_timeout) there was no {self._need(len(without))}"
+                f"in {self.placement_timeout:g} s (placement_timeout) Ray did not start {self._need(len(without))}"
             )
         deaths: dict[int, Exception] = {}
         for reference, index in ready.items():
@@ -526,9 +526,9 @@ class RayVecEnv(VecEnv):
             for amounts in (ray.cluster_resources(), ray.available_resources())
         )
         return (
-            f"room in the cluster for {n_without} of {len(self.restarts)} environments. Each asks for "
-            f"{self._asked_for}; the cluster has {there}, of which {free} is free. Fewer environments, or a smaller "
-            "num_cpus, would fit sooner"
+            f"the processes of {n_without} of {len(self.restarts)} environments. Each asks for {self._asked_for}; the "
+            f"cluster has {there}, of which {free} is free. If that is too little, fewer environments or a smaller "
+            "num_cpus would fit"
         )
 
     def _beginning(self, index: int) -> bytes:
