@@ -38,7 +38,7 @@ except ImportError as error:
 from sb3_knntd.ray_jobs import connect
 
 #: Seconds without room in the cluster after which the user is told what is waited for.
-PATIENCE = 15.0
+PATIENCE = 30.0
 #: What Ray says where a process or its machine has gone, or with it what it had answered.
 DEATHS = (
     RayActorError,
@@ -156,7 +156,7 @@ class EnvActor:
         """
         setattr(self.env, name, value)
 
-    def env_method(self, name: str, *args: Any, **kwargs: Any) -> Any:
+    def env_method(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """
         :param name: of a method of the environment or a wrapper
         :param args: its arguments
@@ -187,7 +187,8 @@ class RayVecEnv(VecEnv):
 
     .. code-block:: python
 
-        venv = make_vec_env("Ant-v5", n_envs=32, vec_env_cls=RayVecEnv, vec_env_kwargs={"address": "auto"})
+        kwargs = {"address": "auto", "num_cpus": 2}
+        venv = make_vec_env("Ant-v5", 32, vec_env_cls=RayVecEnv, vec_env_kwargs=kwargs)
 
     An environment whose process or machine dies is made anew, wherever there is room. Its episode ends with that step,
     truncated: the reward is 0, ``terminal_observation`` in its info is the last observation that was seen,
@@ -238,11 +239,8 @@ class RayVecEnv(VecEnv):
                 f"actor_options cannot have {', '.join(sorted(SETTLED & options.keys()))}: num_cpus and max_restarts "
                 "are parameters of RayVecEnv, and the rest it settles itself"
             )
-        #: as given
         self.max_restarts = check_integer("max_restarts", max_restarts, 0)
-        #: as given
         self.timeout = None if timeout is None else check_number("timeout", timeout, 0.0, above=True)
-        #: as given
         self.placement_timeout = check_number("placement_timeout", placement_timeout, 0.0, above=True)
         options = {
             "scheduling_strategy": "SPREAD",
@@ -412,7 +410,7 @@ class RayVecEnv(VecEnv):
         # Negative ones count from the end.
         return [range(self.num_envs)[index] for index in self._get_indices(indices)]
 
-    def _call(self, targets: Sequence[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
+    def _call(self, targets: Sequence[int], name: str, /, *args: Any, **kwargs: Any) -> list[Any]:
         return self._call_each(targets, [_pickled(name, *args, **kwargs)] * len(targets))
 
     def _call_each(self, targets: Sequence[int], requests: Sequence[bytes]) -> list[Any]:
@@ -462,7 +460,7 @@ class RayVecEnv(VecEnv):
 
     def _tell_of_death(self, index: int, error: Exception) -> None:
         # Ray's messages end with what happened.
-        reason = textwrap.shorten(str(error).strip().splitlines()[-1], 300)
+        reason = textwrap.shorten((str(error).strip() or type(error).__name__).splitlines()[-1], 300)
         if self._deaths_in_row[index] >= self.max_restarts:
             raise RuntimeError(
                 f"environment {index} has died {self._deaths_in_row[index] + 1} times in a row without an episode that "
@@ -558,5 +556,5 @@ class RayVecEnv(VecEnv):
         self._actors = {}
 
 
-def _pickled(name: str, *args: Any, **kwargs: Any) -> bytes:
+def _pickled(name: str, /, *args: Any, **kwargs: Any) -> bytes:
     return bytes(cloudpickle.dumps((name, args, kwargs)))

@@ -46,8 +46,8 @@ class ProbeEnv(gym.Env[np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray:
         return np.full((4, 6, 3), self.length, np.uint8)
 
-    def scaled(self, factor: float, offset: float = 0.0) -> float:
-        return factor * self.length + offset
+    def scaled(self, factor: float, name: float = 0.0) -> float:  # a name that others may have in mind too
+        return factor * self.length + name
 
     def unlucky(self) -> None:
         raise ValueError("no luck today")

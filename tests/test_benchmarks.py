@@ -50,6 +50,19 @@ def test_speed_prints_and_stores_its_table(tmp_path: pathlib.Path) -> None:
         assert f"{what} {stored['machine'][what]}" in machine
 
 
+@pytest.mark.slow
+def test_ray_vec_env_prints_and_stores_its_table(tmp_path: pathlib.Path) -> None:
+    file = tmp_path / "steps.json"
+    command = [sys.executable, "-m", "benchmarks.ray_vec_env", "--repeats", "1", "--json", str(file)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    rows = json.loads(file.read_text())["rows"]
+    assert [row["seconds"] for row in rows] == [0.0, 0.01]
+    for row, printed in zip(rows, done.stdout.splitlines()[2:4], strict=True):
+        assert min(row["subproc"], row["ray"]) > 1e3 * row["seconds"]
+        assert printed == f"| {1e3 * row['seconds']:g} | {row['subproc']:.2f} | {row['ray']:.2f} |"
+
+
 def test_speed_refuses_what_it_does_not_know(
     benchmarks: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import re
 import signal
@@ -174,7 +173,7 @@ def test_attributes_and_methods(venv: RayVecEnv, model_venv: SubprocVecEnv, indi
         lambda each: each.get_attr("knob", indices),
         lambda each: each.get_attr("knob"),
         lambda each: each.get_attr("length", indices),
-        lambda each: each.env_method("scaled", 2.0, indices=indices, offset=1.0),
+        lambda each: each.env_method("scaled", 2.0, indices=indices, name=1.0),
         lambda each: each.env_is_wrapped(Monitor, indices),
         lambda each: each.env_is_wrapped(gym.wrappers.TimeLimit, indices),
     ):
@@ -526,17 +525,3 @@ def test_a_cluster_elsewhere(cluster: Cluster) -> None:
     finally:
         server.stop(0)
     assert done.stdout.endswith("done [1, 0]\n"), done.stderr[-3000:]
-
-
-@pytest.mark.slow
-def test_benchmark(tmp_path: Path) -> None:
-    """It starts a Ray of its own, as programs do that are connected to none. Its figures are the machine's own."""
-    file = tmp_path / "steps.json"
-    command = [sys.executable, "-m", "benchmarks.ray_vec_env", "--repeats", "1", "--json", str(file)]
-    done = subprocess.run(command, cwd=Path(TESTS).parent, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-3000:]
-    stored = json.loads(file.read_text())
-    assert [row["seconds"] for row in stored["rows"]] == [0.0, 0.01]
-    for row, printed in zip(stored["rows"], done.stdout.splitlines()[2:4], strict=True):
-        assert min(row["subproc"], row["ray"]) > 1e3 * row["seconds"]
-        assert printed == f"| {1e3 * row['seconds']:g} | {row['subproc']:.2f} | {row['ray']:.2f} |"
