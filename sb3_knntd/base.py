@@ -130,10 +130,6 @@ class KNNAlgorithm(BaseAlgorithm):
     def _make_exploration_schedule(self) -> Schedule:
         """Check the parameters of exploration and make the schedule of its rate."""
 
-    @abstractmethod
-    def _env_actions(self, actions: np.ndarray) -> np.ndarray:
-        """From the rule's actions to those of the environment, an array of its own, shape (n_envs, *action_shape)."""
-
     # ----------------------------------------------------------------- set-up
 
     @classmethod
@@ -188,7 +184,9 @@ class KNNAlgorithm(BaseAlgorithm):
         self._check_parameters()
         self._setup_lr_schedule()
         self.trace_schedule = FloatSchedule(self.trace_decay)
-        self._trace_decay_is_constant = not callable(self.trace_decay)
+        # Most keep both as they are, and a call more is felt in steps this short.
+        alpha, trace_decay = self.learning_rate, self.trace_decay
+        self._constant_rates = None if callable(alpha) or callable(trace_decay) else (alpha, trace_decay)
         self.exploration_schedule = self._make_exploration_schedule()
         normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
@@ -285,7 +283,7 @@ class KNNAlgorithm(BaseAlgorithm):
         nothing = th.full((len(rows), len(self._rule.blocks) - 1), UNDRAWN, device=rows.device)
         held = self._rule.hold(nothing, uniforms, rate, th.zeros(len(rows), device=rows.device))
         choice = self._rule.choose(rows, probabilities, uniforms, rate, held)
-        return self._env_actions(choice.actions.cpu().numpy()).reshape(greedy.shape), state
+        return self.policy.fit_actions(choice.actions.cpu().numpy()).reshape(greedy.shape), state
 
     # --------------------------------------------------------------- learning
 
@@ -363,7 +361,7 @@ class KNNAlgorithm(BaseAlgorithm):
         actions = self._last_actions
         if actions is None or self._measuring:
             actions = self._random_actions() if self._measuring else self._first_actions()
-        actions = self._env_actions(actions)
+        actions = self.policy.fit_actions(actions)
         new_obs, rewards, dones, infos = env.step(actions)
         n_before = self.num_timesteps
         self.num_timesteps += env.num_envs
@@ -411,9 +409,8 @@ class KNNAlgorithm(BaseAlgorithm):
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
         self.exploration_rate = rate = self.exploration_schedule(progress)
-        # Most keep λ as it is, and a call more is felt in steps this short.
-        trace_decay = self.trace_decay if self._trace_decay_is_constant else self.trace_schedule(progress)
-        return self.lr_schedule(progress), trace_decay, rate  # type: ignore[return-value]
+        alpha, trace_decay = self._constant_rates or (self.lr_schedule(progress), self.trace_schedule(progress))
+        return alpha, trace_decay, rate
 
     def _first_actions(self) -> np.ndarray:
         """The actions chosen at the start of the episodes."""

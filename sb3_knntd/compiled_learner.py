@@ -74,7 +74,10 @@ class CompiledLearner(Learner):
         """Take up perception and memory as they are now, and reckon for how many steps there is room."""
         self._eyes = self.perceiver.eyes
         memory, chance = self.live.memory(), (self.stream.rows, self.stream.taken)
+        # A desk does not keep its arrays. All others are in attributes of their own.
+        self._lent = memory, chance
         self._desk = set_desk(self._eyes, self._rule, self._form, self._episodes, memory, chance, self._work)
+        self._learn = kernel.learn_on(self._desk)
         self._steps_of_room = min(self.live.room, self.table.room) // self._most_new_points
 
     def _make_room(self) -> None:
@@ -116,15 +119,14 @@ class CompiledLearner(Learner):
             self._truncated[truncated] = True
             self._last_observations[truncated] = as_rows(last_observations)
             self._find(self._last_observations[truncated], kernel.LAST, truncated)
-        answer = kernel.learn(self._desk, seen, rewards, ended, rates)
+        answer = self._learn(seen, rewards, ended, rates)
         if answer == kernel.USED_UP:
             self.stream.refill()
-            answer = kernel.learn(self._desk, seen, rewards, ended, rates)
+            answer = self._learn(seen, rewards, ended, rates)
         if truncated:
             self._truncated[:] = False
-        if answer == kernel.NOT_FINITE:
+        if answer != kernel.FINE:
             check_transition(observations, rewards)
-        if answer == kernel.DIVERGED:
             raise FloatingPointError(DIVERGENCE)
         self._n_sums += self.n_envs
         return self._actions

@@ -169,9 +169,6 @@ class ExA(KNNAlgorithm):
     def _make_exploration_schedule(self) -> Schedule:
         return self._make_epsilon_schedule()
 
-    def _env_actions(self, actions: np.ndarray) -> np.ndarray:
-        return self.policy.fit_actions(actions)
-
     def _random_actions(self) -> np.ndarray:
         uniforms, columns = self._stream.next()[:, 0], self.policy.columns
         n_blocks = len(columns.blocks) - 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
@@ -165,11 +164,6 @@ class KNNTD(KNNAlgorithm):
         epsilon = self._make_epsilon_schedule()
         self.temperature = check_schedule("temperature", self.temperature, 0.0, above=True)
         return FloatSchedule(self.temperature) if self.exploration == "softmax" else epsilon
-
-    def _env_actions(self, actions: np.ndarray) -> np.ndarray:
-        assert isinstance(self.action_space, spaces.Discrete)
-        env_actions: np.ndarray = actions + self.action_space.start
-        return env_actions
 
     def learn(
         self: SelfKNNTD,

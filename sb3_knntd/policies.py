@@ -110,6 +110,8 @@ class KNNPolicy(BasePolicy):
             assert isinstance(action_space, spaces.Discrete)
             n_actions = int(action_space.n)
             columns = ActionColumns(np.empty((n_actions, 0)), np.array([0, n_actions]), [])
+            # An array is added faster than a number.
+            self._first_action = np.asarray(action_space.start)
         #: what each column of the table stands for
         self.columns = columns
         self.table = self._make_table(table, places, int(columns.blocks[-1]), initial_value, dtype)
@@ -240,11 +242,17 @@ class KNNPolicy(BasePolicy):
         best_entries(seen, eyes, indices, probabilities, values, row_slots, initial, blocks, self._AVERAGES, entries)
         return entries, probabilities
 
+    def fit_actions(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: numbers of actions from 0 on, shape (batch,)
+        :return: the same as the environment counts them, an array of its own
+        """
+        fitting: np.ndarray = actions + self._first_action
+        return fitting
+
     def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         """Actions of the environment, (batch, *action_shape), from what the neighbours recommend."""
-        assert isinstance(self.action_space, spaces.Discrete)
-        actions: np.ndarray = entries[:, 0, 0] + self.action_space.start
-        return actions
+        return self.fit_actions(entries[:, 0, 0])
 
     def forward(self, observation: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
@@ -323,6 +331,9 @@ class ExAPolicy(KNNPolicy):
         super().__init__(observation_space, action_space, lr_schedule, columns=columns, **arguments)
         self._arguments |= {"action_points": action_points, "action_table": action_table}
         self._actions_are_whole = np.issubdtype(action_space.dtype, np.integer)
+        self._action_shape, self._action_type = (-1, *action_space.shape), action_space.dtype
+        # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
+        self._can_exceed = action_space.dtype != np.float32
 
     @property
     def action_points(self) -> list[th.Tensor]:
@@ -334,15 +345,13 @@ class ExAPolicy(KNNPolicy):
         :param actions: shape (batch, action_dim), action units
         :return: the same as the environment takes them: in its shape and type, rounding kept within its bounds
         """
-        space = self.action_space
-        assert isinstance(space, spaces.Box)
         if self._actions_are_whole:
             actions = np.rint(actions)
-        fitting: np.ndarray = actions.reshape(-1, *space.shape).astype(space.dtype)
-        # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
-        if space.dtype != np.float32:
-            np.maximum(fitting, space.low, out=fitting)
-            np.minimum(fitting, space.high, out=fitting)
+        fitting: np.ndarray = actions.reshape(self._action_shape).astype(self._action_type)
+        if self._can_exceed:
+            assert isinstance(self.action_space, spaces.Box)
+            np.maximum(fitting, self.action_space.low, out=fitting)
+            np.minimum(fitting, self.action_space.high, out=fitting)
         return fitting
 
     def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:

@@ -94,14 +94,15 @@ def total(live, place, action, pace):
 
 
 @jit
-def best_live_entry(live, place, first, end, pace):
-    """The first of the best columns of a live point, from ``first`` to before ``end``."""
-    best, largest = first, total(live, place, first, pace)
-    for action in range(first + 1, end):
-        value = total(live, place, action, pace)
-        if value > largest:
-            best, largest = action, value
-    return best
+def read_live_row(live, place, pace, row):
+    """Write the values of a live point's actions into ``row``, shape (n_actions,)."""
+    if len(pace) == 2:
+        entries, gained = live[place], pace[1]
+        for action in range(len(row)):
+            row[action] = entries[action, 2] + entries[action, 0] * gained
+    else:
+        for action in range(len(row)):
+            row[action] = total(live, place, action, pace)
 
 
 @jit
@@ -109,8 +110,7 @@ def read_row(point, values, row_slots, initial, live, live_slots, pace, row):
     """Write the values of a point's actions into ``row``, shape (n_actions,)."""
     place = find(point, live_slots)
     if place >= 0:
-        for action in range(len(row)):
-            row[action] = total(live, place, action, pace)
+        read_live_row(live, place, pace, row)
     else:
         read_stored_row(point, values, row_slots, initial, row)
 
@@ -185,26 +185,40 @@ def publish(values, row_slots, live_points, live, counts, pace):
 
 
 @jit
+def _pay(live, place, pace):
+    """Bring the bases of a live point up to date and its x to what they are with c = 1; whether a trace is left."""
+    n_envs, alive = len(pace) - 1, False
+    if n_envs == 1:
+        entries, clock, gained = live[place], pace[0], pace[1]
+        for action in range(len(entries)):
+            entries[action, 2] += entries[action, 0] * gained
+            trace = entries[action, 0] * clock
+            entries[action, 0] = trace if trace >= LEAST_TRACE else 0.0
+            alive |= trace >= LEAST_TRACE
+        return alive
+    for action in range(live.shape[1]):
+        live[place, action, n_envs + 1] = total(live, place, action, pace)
+        lost = False
+        for env in range(n_envs):
+            trace = live[place, action, env] * pace[0]
+            if trace < LEAST_TRACE:
+                lost = lost or trace > 0.0
+                trace = 0.0
+            else:
+                alive = True
+            live[place, action, env] = trace
+        if lost:
+            _reshare(live, place, action)
+    return alive
+
+
+@jit
 def settle(values, row_slots, live_points, live, live_slots, counts, pace):
     """Pay all debts, let go what has no trace left, and start c and G afresh."""
     n_envs = len(pace) - 1
     kept = 0
     for place in range(counts[1]):
-        alive = False
-        for action in range(live.shape[1]):
-            live[place, action, n_envs + 1] = total(live, place, action, pace)
-            lost = False
-            for env in range(n_envs):
-                trace = live[place, action, env] * pace[0]
-                if trace < LEAST_TRACE:
-                    lost = lost or trace > 0.0
-                    trace = 0.0
-                else:
-                    alive = True
-                live[place, action, env] = trace
-            if lost:
-                _reshare(live, place, action)
-        if alive:
+        if _pay(live, place, pace):
             if kept < place:
                 live_points[kept] = live_points[place]
                 live[kept] = live[place]

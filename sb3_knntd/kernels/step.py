@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cache, partial
+
 import numpy as np
 
-from sb3_knntd.kernels.jit import jit
+from sb3_knntd.kernels.desk import desk_at, place_of
+from sb3_knntd.kernels.jit import AVAILABLE, jit
 from sb3_knntd.kernels.memory import (
     LEAST_CLOCK,
-    best_live_entry,
     end_episode,
     enliven,
+    read_live_row,
     read_row,
     read_stored_row,
     set_trace,
@@ -286,7 +289,7 @@ def learn(desk, observations, rewards, ended, rates):
         desk.pace,
     )
     indices, probabilities, entries, actions = desk.indices, desk.probabilities, desk.entries, desk.actions
-    places, corrections, blocks = desk.places, desk.corrections, desk.blocks
+    places, corrections, blocks, row = desk.places, desk.corrections, desk.blocks, desk.means[0]
     _, n_envs, k, n_blocks = entries.shape
     size, value_sum = 0.0, 0.0
 
@@ -311,11 +314,12 @@ def learn(desk, observations, rewards, ended, rates):
             )
             places[env, i] = place
             probability = probabilities[NOW, env, i]
-            for block in range(n_blocks):
-                entry = entries[NOW, env, i, block]
-                if desk.rule == EACH:
-                    entry = best_live_entry(live, place, blocks[block], blocks[block + 1], pace)
-                value += probability * total(live, place, entry, pace) / n_blocks
+            if desk.rule == AVERAGE:
+                value += probability * total(live, place, entries[NOW, env, i, 0], pace)
+            else:
+                read_live_row(live, place, pace, row)
+                for block in range(n_blocks):
+                    value += probability * row[best_action(row, blocks[block], blocks[block + 1])] / n_blocks
             squares += probability * probability
         error = rewards[env] + desk.gamma * worth - value
         corrections[env] = learning_rate * error / squares if desk.normalized else learning_rate * error
@@ -357,6 +361,26 @@ def learn(desk, observations, rewards, ended, rates):
             for block in range(n_blocks):
                 entries[NOW, env, i, block] = entries[THEN, env, i, block]
     return FINE
+
+
+@cache
+def _learn_at(kind):
+    @jit
+    def learn_at(address, observations, rewards, ended, rates):
+        return learn(desk_at(address, kind), observations, rewards, ended, rates)
+
+    return learn_at
+
+
+def learn_on(desk):
+    """
+    :param desk: see :mod:`sb3_knntd.kernels.desk`; to be kept for as long as the function is
+    :return: :func:`learn` for this desk, a function of its other arguments
+    """
+    if not AVAILABLE:
+        return partial(learn, desk)
+    address, kind = place_of(desk)
+    return partial(_learn_at(kind), address)
 
 
 @jit
