@@ -14,18 +14,17 @@ from __future__ import annotations
 import argparse
 import json
 from concurrent.futures import ProcessPoolExecutor
-from importlib.resources import files
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 import sb3_knntd.envs  # noqa: F401
+from benchmarks.learning import tuned_settings
 from benchmarks.machine import describe
 from sb3_knntd import KNNTD, VecDeltaFilter
 
@@ -78,8 +77,7 @@ def settings() -> dict[str, Any]:
     """
     :return: arguments of the learner in ``zoo_configs/knntd.yml``
     """
-    stored = yaml.safe_load(files("sb3_knntd.zoo_configs").joinpath("knntd.yml").read_text())[ENV_ID]
-    return {name: value for name, value in stored.items() if name not in ("n_timesteps", "policy", "vec_env_wrapper")}
+    return {name: value for name, value in tuned_settings("knntd", ENV_ID).items() if name != "vec_env_wrapper"}
 
 
 def learn(sight: Sight, problem: int) -> list[int]:

@@ -6,8 +6,10 @@ import os
 import platform
 import resource
 import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 
+#: Those that decide what a run computes.
 PACKAGES = (
     "sb3-knntd",
     "stable-baselines3",
@@ -21,11 +23,12 @@ PACKAGES = (
 )
 
 
-def versions() -> dict[str, str]:
+def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
     """
-    :return: of Python and the packages that decide what a run computes
+    :param packages: names of installed distributions
+    :return: Python's version and theirs
     """
-    return {"python": platform.python_version(), **{package: version(package) for package in PACKAGES}}
+    return {"python": platform.python_version(), **{package: version(package) for package in packages}}
 
 
 def machine() -> dict[str, str]:
