@@ -28,7 +28,7 @@ from toy_envs import GridEnv
 from sb3_knntd import KNNTD, policies
 from sb3_knntd.compiled_learner import CompiledLearner
 from sb3_knntd.kernels import memory as memory_kernels
-from sb3_knntd.kernels import nearest, perceive, step
+from sb3_knntd.kernels import desk, nearest, perceive, step
 from sb3_knntd.learner import TorchLearner
 from sb3_knntd.memory import DenseTable, HashedTable
 
@@ -548,6 +548,8 @@ def dispatchers() -> Iterator[tuple[str, Any]]:
         for name, value in vars(module).items():
             if hasattr(value, "py_func") and value.py_func.__module__ == module.__name__:
                 yield name, value
+    for number, kind in enumerate(desk._KINDS):
+        yield f"learn_at {number}", step._learn_at(kind)
 
 
 def test_kernels_are_cached_and_release_the_lock() -> None:
@@ -654,7 +656,7 @@ def test_kernels_are_compiled_once_for_all_processes() -> None:
     if any(misses for _, misses in report["last"]["tree"].values()):
         report = in_a_new_process()
     assert all(misses == 0 for state in report["last"].values() for _, misses in state.values())
-    for kernel in ("learn", "begin"):
+    for kernel in ("learn_at 0", "begin"):
         assert report["hits"][kernel] > 0
 
 

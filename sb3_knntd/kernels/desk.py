@@ -140,6 +140,18 @@ if AVAILABLE:
 else:
     Desk = namedtuple("Desk", FIELDS)  # type: ignore[no-redef, misc]
 
+    def lend(value):  # type: ignore[misc]
+        """Nobody counts references here that need not be."""
+        return value
+
+    def place_of(desk: Desk) -> tuple[int, str]:
+        """A desk is its own address."""
+        return desk, ""  # type: ignore[return-value]
+
+    def desk_at(address, kind):  # type: ignore[misc]
+        """What :func:`place_of` was given."""
+        return address
+
 
 @jit
 def set_desk(eyes, choice, form, episodes, memory, chance, work):

@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 
 from sb3_knntd.kernels.desk import desk_at, place_of
-from sb3_knntd.kernels.jit import AVAILABLE, jit
+from sb3_knntd.kernels.jit import jit
 from sb3_knntd.kernels.memory import (
     LEAST_CLOCK,
     end_episode,
@@ -377,8 +377,6 @@ def learn_on(desk):
     :param desk: see :mod:`sb3_knntd.kernels.desk`; to be kept for as long as the function is
     :return: :func:`learn` for this desk, a function of its other arguments
     """
-    if not AVAILABLE:
-        return partial(learn, desk)
     address, kind = place_of(desk)
     return partial(_learn_at(kind), address)
 
