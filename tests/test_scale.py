@@ -27,8 +27,8 @@ from toy_envs import GridEnv
 
 from sb3_knntd import KNNTD, policies
 from sb3_knntd.compiled_learner import CompiledLearner
-from sb3_knntd.kernels import memory as memory_kernels
 from sb3_knntd.kernels import desk, nearest, perceive, step
+from sb3_knntd.kernels import memory as memory_kernels
 from sb3_knntd.learner import TorchLearner
 from sb3_knntd.memory import DenseTable, HashedTable
 
