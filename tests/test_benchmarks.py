@@ -10,6 +10,7 @@ import subprocess
 import sys
 from typing import Any
 
+import optuna
 import pytest
 import yaml
 from stable_baselines3.common.env_util import make_vec_env
@@ -18,6 +19,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd import KNNTD, cli
 from sb3_knntd.jobs import Job, Outcome
+from sb3_knntd.zoo.schedules import with_schedules
+from sb3_knntd.zoo.search_space import SAMPLERS, attributes
 
 ROOT = pathlib.Path(__file__).parent.parent
 
@@ -266,3 +269,24 @@ def test_competition_is_learned_with_the_stored_configuration(benchmarks: Any) -
     assert settings["bounds"] == "adaptive"
     assert not {"policy", "n_timesteps", "vec_env_wrapper"} & set(settings)
     KNNTD(competition.ENV_ID, **settings)
+
+
+def test_a_second_look_is_at_the_best_trials_and_what_is_there(benchmarks: Any) -> None:
+    present = benchmarks("zoo").configurations()["knntd", "CartPole-v1"]
+    study = optuna.create_study(direction="maximize")
+
+    def objective(trial: optuna.Trial) -> float:
+        for name, value in attributes(4, present).items():
+            trial.set_user_attr(name, value)
+        SAMPLERS["knntd"](trial, 2, 1, {})
+        return [1.0, 3.0, 2.0][trial.number]
+
+    study.optimize(objective, n_trials=3)
+    tried = benchmarks("tuning").candidates("knntd", present, study, best=2)
+    assert list(tried) == ["present", "1", "2"]
+    assert tried["present"] == present
+    for name in ("1", "2"):
+        assert tried[name]["points"] == present["points"]
+        assert tried[name]["gamma"] == pytest.approx(1 - study.trials[int(name)].params["one_minus_gamma"], abs=1e-3)
+        arguments = {key: value for key, value in tried[name].items() if key not in ("n_timesteps", "policy")}
+        KNNTD("CartPole-v1", **with_schedules(arguments))
