@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from pathlib import Path
 import job_functions
 import pytest
 
+from sb3_knntd import jobs as jobs_module
 from sb3_knntd.files import replace_file
 from sb3_knntd.jobs import Job, Outcome, run_jobs
 
@@ -146,6 +148,35 @@ def test_interrupted_it_keeps_what_is_finished_and_goes_on(tmp_path: Path, blow:
         assert subprocess.run([*command, "0"], env=environment, timeout=60, check=False).returncode == 0
         assert (folder / "quick.json").read_text() == first
         assert json.loads((folder / "slow.json").read_text())["result"] != worker
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="cannot start a process that has signals blocked")
+def test_ctrl_c_waits_until_a_process_is_started() -> None:
+    """Any thread may receive it, and its process would come to the world half told what to do."""
+    program = "import signal; print(signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
+    blocked = []
+
+    def interrupted_start() -> None:
+        with jobs_module._interrupts_held():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.1)
+            blocked.append(subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=True).stdout)
+
+    done = threading.Event()
+    other = threading.Thread(target=done.wait)
+    other.start()
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted_start()
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        done.set()
+        other.join()
+    assert len(blocked) == 1
+    assert b"SIGINT" in blocked[0]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 @pytest.mark.parametrize("key", ["", "a/b", "..", ".hidden", "a b"])
