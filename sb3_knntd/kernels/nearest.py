@@ -8,74 +8,115 @@ from sb3_knntd.kernels.jit import jit
 
 
 @jit
-def _before(sums, nodes, a, b):
-    """Whether node a comes before node b."""
-    return sums[a] < sums[b] or (sums[a] == sums[b] and nodes[a, 0] < nodes[b, 0])
+def _next_coordinate(x, axes, below, above, first, end):
+    """
+    Which of the next coordinates on either side of x is nearer, the lower of equals, and the square of how far it is.
 
-
-@jit
-def _sift_down(order, size, sums, nodes):
-    """Let the first node of the heap sink to its place."""
-    node, position, child = order[0, 0], 0, 1
-    while child < size:
-        if child + 1 < size and _before(sums, nodes, order[0, child + 1], order[0, child]):
-            child += 1
-        if not _before(sums, nodes, order[0, child], node):
-            break
-        order[0, position] = order[0, child]
-        position = child
-        child = 2 * position + 1
-    order[0, position] = node
-
-
-@jit
-def _sift_up(order, position, sums, nodes):
-    """Let a node of the heap rise to its place."""
-    node = order[0, position]
-    while position > 0:
-        parent = (position - 1) // 2
-        if not _before(sums, nodes, node, order[0, parent]):
-            break
-        order[0, position] = order[0, parent]
-        position = parent
-    order[0, position] = node
-
-
-@jit
-def _extend(x, axes, first, end, dimension, ranked, squares, sides):
-    """Rank one more coordinate of a dimension: the next nearest of those on either side."""
-    filled, below, above = sides[dimension, 0], sides[dimension, 1], sides[dimension, 2]
-    down = x - axes[first + below] if below >= 0 else np.inf
-    up = axes[first + above] - x if first + above < end else np.inf
+    :param below: the next one down; none if it is less than ``first``
+    :param above: the next one up; none if it is ``end``
+    """
+    down = x - axes[below] if below >= first else np.inf
+    up = axes[above] - x if above < end else np.inf
     down, up = down * down, up * up
-    if down <= up:
-        ranked[first + filled], squares[first + filled] = below, down
-        sides[dimension, 1] = below - 1
-    else:
-        ranked[first + filled], squares[first + filled] = above, up
-        sides[dimension, 2] = above + 1
-    sides[dimension, 0] = filled + 1
+    return (below, down) if down <= up else (above, up)
 
 
 @jit
-def _blurred(scaled, axes, offsets, total, ranked, squares, sides):
+def _coordinates_up_to(x, axes, first, end):
+    """How many of a dimension's coordinates are at most x."""
+    low, high = first, end
+    while low < high:
+        middle = (low + high) // 2
+        if axes[middle] <= x:
+            low = middle + 1
+        else:
+            high = middle
+    return low - first
+
+
+@jit
+def _first_on_lattice(scaled, axes, offsets, count):
+    """
+    The ``count`` smallest sums of squares, one for each dimension, and the numbers of their points.
+
+    Dimension by dimension, a list of the first points in the dimensions so far becomes one with the next dimension.
+    Each coordinate of that, by rising distance, makes a row: the list with the coordinate's square added. The rows are
+    merged, none of which can come to its turn before the last one's first has.
+
+    :param scaled: observation, scaled units, shape (obs_dim,)
+    :param axes: the coordinates of every dimension one after the other, each rising
+    :param offsets: where each dimension's begin, and the end, shape (obs_dim + 1,), int64
+    :param count: how many, at most the number of points
+    :return: sums and numbers, in their order, of shape (count,) each
+    """
+    # The list as it was and as it becomes; and of each row its square and the sum that it has next, its coordinate and
+    # where in the list it is.
+    floats, integers = np.empty((4, count)), np.empty((4, count), np.int64)
+    sums, before, squares, nexts = floats[0], floats[1], floats[2], floats[3]
+    numbers, numbers_before, coordinates, places = integers[0], integers[1], integers[2], integers[3]
+    sums[0], numbers[0], filled = 0.0, 0, 1
+    for j in range(len(scaled)):
+        first, end = offsets[j], offsets[j + 1]
+        size, x = end - first, scaled[j]
+        sums, before, numbers, numbers_before = before, sums, numbers_before, numbers
+        above = first + _coordinates_up_to(x, axes, first, end)
+        below = above - 1
+        # Rows from ``opened`` to before ``n_rows`` have begun and are not at their end.
+        opened, n_rows, newest = 0, 0, True
+        n_merged = min(count, filled * size)
+        for i in range(n_merged):
+            if newest and n_rows < size:
+                coordinate, square = _next_coordinate(x, axes, below, above, first, end)
+                if coordinate == below:
+                    below -= 1
+                else:
+                    above += 1
+                squares[n_rows], coordinates[n_rows], places[n_rows] = square, coordinate - first, 0
+                nexts[n_rows] = before[0] + square
+                n_rows += 1
+            row, number = opened, numbers_before[places[opened]] * size + coordinates[opened]
+            for other in range(opened + 1, n_rows):
+                if nexts[other] <= nexts[row]:
+                    others = numbers_before[places[other]] * size + coordinates[other]
+                    if nexts[other] < nexts[row] or others < number:
+                        row, number = other, others
+            total, place = nexts[row], i
+            # Where rounding has made a tie, a lower number can come late.
+            while place > 0 and sums[place - 1] == total and numbers[place - 1] > number:
+                sums[place], numbers[place] = total, numbers[place - 1]
+                place -= 1
+            sums[place], numbers[place] = total, number
+            newest = row == n_rows - 1 and places[row] == 0
+            places[row] += 1
+            nexts[row] = before[places[row]] + squares[row] if places[row] < filled else np.inf
+            while opened < n_rows and places[opened] == filled:
+                opened += 1
+        filled = n_merged
+    return sums, numbers
+
+
+@jit
+def _blurred(scaled, axes, offsets, total):
     """
     Whether two coordinates at different distances could give the same sum, of about ``total``, by rounding. If
-    not, equal sums have equal terms, of which the lower coordinate is ranked first: what comes out of the heap
-    later has a higher index.
+    not, equal sums have equal terms, and of equals the lower coordinate comes first.
     """
-    n_dims = len(scaled)
-    least = 2.0 * n_dims * 2.3e-16 * total
-    for j in range(n_dims):
+    least = 2.0 * len(scaled) * 2.3e-16 * total
+    for j in range(len(scaled)):
         first, end = offsets[j], offsets[j + 1]
-        for place in range(first + 1, end):
-            if place - first >= sides[j, 0]:
-                _extend(scaled[j], axes, first, end, j, ranked, squares, sides)
-            if squares[place] > total + least:
+        above = first + _coordinates_up_to(scaled[j], axes, first, end)
+        below, before = above - 1, -np.inf
+        while below >= first or above < end:
+            coordinate, square = _next_coordinate(scaled[j], axes, below, above, first, end)
+            if square > total + least:
                 break
-            difference = squares[place] - squares[place - 1]
-            if 0.0 < difference <= least:
+            if 0.0 < square - before <= least:
                 return True
+            before = square
+            if coordinate == below:
+                below -= 1
+            else:
+                above += 1
     return False
 
 
@@ -84,11 +125,10 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
     """
     The k nearest points of a lattice, without visiting the others.
 
-    A squared distance is a sum over the dimensions, so that with each dimension's coordinates ranked by
-    distance the points come out of a heap in order: a point is followed by those one rank further in one
-    dimension. Rounding keeps sums in that order. Points that tie come out by rising index, unless rounding could have
-    made them tie; then all that equal the k-th are taken out before the lower indices among them are chosen. So the
-    answer is that of a search over all points.
+    A squared distance is a sum over the dimensions, and a point of which k others are at least as near in every
+    dimension is not among the first. So a list of k is enough to go from dimension to dimension; rounding keeps sums in
+    order. Points that tie are in order of index, unless rounding could have made them tie; then as many are looked
+    at as equal the k-th. So the answer is that of a search over all points.
 
     :param scaled: observation, scaled units, shape (obs_dim,)
     :param axes: the coordinates of every dimension one after the other, each rising
@@ -97,87 +137,19 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
     :param indices: to be filled, shape (k,), int64
     :param distances: to be filled with squared distances, shape (k,)
     """
-    n_dims = len(scaled)
-    ranked = np.empty(len(axes), np.int64)
-    squares = np.empty(len(axes))
-    # Of each dimension: how many coordinates are ranked, the next below and above, and its stride.
-    sides = np.empty((n_dims, 4), np.int64)
-    # A node is a point: its number, the dimension that was moved along last, and its rank in each. Points are
-    # reached by moving along rising dimensions only, so each just once.
-    capacity = (k + 8) * n_dims + 1
-    nodes = np.empty((capacity, n_dims + 2), np.int64)
-    sums = np.empty(capacity)
-    # Which nodes are in the heap, and which have been taken out.
-    order = np.empty((2, capacity), np.int64)
-
-    stride, number, total = 1, 0, 0.0
-    for j in range(n_dims - 1, -1, -1):
-        first, end = offsets[j], offsets[j + 1]
-        low, high = first, end
-        while low < high:
-            middle = (low + high) // 2
-            if axes[middle] <= scaled[j]:
-                low = middle + 1
-            else:
-                high = middle
-        sides[j, 0], sides[j, 1], sides[j, 2], sides[j, 3] = 0, low - first - 1, low - first, stride
-        _extend(scaled[j], axes, first, end, j, ranked, squares, sides)
-        number += ranked[first] * stride
-        nodes[0, 2 + j] = 0
-        stride *= end - first
-    for j in range(n_dims):
-        total += squares[offsets[j]]
-    nodes[0, 0], nodes[0, 1], sums[0], order[0, 0] = number, 0, total, 0
-    n_nodes, n_heap, n_taken = 1, 1, 0
-
-    while n_heap > 0:
-        if n_taken >= k:
-            if sums[order[0, 0]] != sums[order[1, n_taken - 1]]:
-                break
-            if n_taken == k and not _blurred(scaled, axes, offsets, sums[order[0, 0]], ranked, squares, sides):
-                break
-        node = order[0, 0]
-        n_heap -= 1
-        order[0, 0] = order[0, n_heap]
-        _sift_down(order, n_heap, sums, nodes)
-        order[1, n_taken] = node
-        n_taken += 1
-        if n_nodes + n_dims > capacity:
-            nodes = np.concatenate((nodes, np.empty_like(nodes)))
-            sums = np.concatenate((sums, np.empty_like(sums)))
-            order = np.concatenate((order, np.empty_like(order)), axis=1)
-            capacity *= 2
-        for j in range(nodes[node, 1], n_dims):
-            rank = nodes[node, 2 + j] + 1
-            if rank >= offsets[j + 1] - offsets[j]:
-                continue
-            if rank >= sides[j, 0]:
-                _extend(scaled[j], axes, offsets[j], offsets[j + 1], j, ranked, squares, sides)
-            # Summed afresh in the dimensions' order: adding the difference would round another way.
-            total = 0.0
-            for i in range(n_dims):
-                nodes[n_nodes, 2 + i] = rank if i == j else nodes[node, 2 + i]
-                total += squares[offsets[i] + nodes[n_nodes, 2 + i]]
-            place = offsets[j] + rank
-            nodes[n_nodes, 0] = nodes[node, 0] + (ranked[place] - ranked[place - 1]) * sides[j, 3]
-            nodes[n_nodes, 1] = j
-            sums[n_nodes] = total
-            order[0, n_heap] = n_nodes
-            _sift_up(order, n_heap, sums, nodes)
-            n_nodes += 1
-            n_heap += 1
-
-    # Taken in order of distance; equals among them not always in order of index.
-    for i in range(1, n_taken):
-        node = order[1, i]
-        place = i
-        while place > 0 and _before(sums, nodes, node, order[1, place - 1]):
-            order[1, place] = order[1, place - 1]
-            place -= 1
-        order[1, place] = node
+    n_points = 1
+    for j in range(len(scaled)):
+        n_points *= offsets[j + 1] - offsets[j]
+    # One more tells whether the last has equals.
+    count = min(k + 1, n_points)
+    sums, numbers = _first_on_lattice(scaled, axes, offsets, count)
+    if count > k and sums[k] == sums[k - 1] and _blurred(scaled, axes, offsets, sums[k]):
+        while count < n_points and sums[count - 1] == sums[k - 1]:
+            count = min(2 * count, n_points)
+            sums, numbers = _first_on_lattice(scaled, axes, offsets, count)
     for i in range(k):
-        indices[i] = nodes[order[1, i], 0]
-        distances[i] = sums[order[1, i]]
+        indices[i] = numbers[i]
+        distances[i] = sums[i]
 
 
 @jit

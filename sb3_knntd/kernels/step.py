@@ -53,19 +53,29 @@ def best_action(values, first, end):
 
 
 @jit
+def largest(values, first, end):
+    """The largest value from ``first`` to before ``end``."""
+    value = values[first]
+    for action in range(first + 1, end):
+        if values[action] > value:
+            value = values[action]
+    return value
+
+
+@jit
 def greedy_action(values, first, end, uniform, random_ties):
     """The best action from ``first`` to before ``end``, drawn from equals or the first of them."""
-    best, ties = first, 1
-    for action in range(first + 1, end):
-        if values[action] > values[best]:
-            best, ties = action, 1
-        elif values[action] == values[best]:
+    value = largest(values, first, end)
+    best, ties = first, 0
+    for action in range(end - 1, first - 1, -1):
+        if values[action] == value:
+            best = action
             ties += 1
     if ties == 1 or not random_ties:
         return best
     rank = pick(uniform, ties)
     for action in range(best, end):
-        if values[action] == values[best]:
+        if values[action] == value:
             if rank == 0:
                 return action
             rank -= 1
@@ -262,7 +272,7 @@ def begin(desk, observations, uniforms, rate):
 
 
 @jit
-def learn(desk, observations, rewards, ended, rates):
+def learn(desk, observations, rewards, ended, learning_rate, trace_decay, rate):
     """
     Perceive, choose, compute the TD errors and credit them (Algorithm 3), in all environments at once: every
     value is read before any is changed.
@@ -271,7 +281,9 @@ def learn(desk, observations, rewards, ended, rates):
     :param observations: observation units, shape (n_envs, obs_dim)
     :param rewards: shape (n_envs,)
     :param ended: whether the episodes have, shape (n_envs,), bool
-    :param rates: (α, λ, ε or temperature)
+    :param learning_rate: α
+    :param trace_decay: λ
+    :param rate: ε or the temperature
     :return: ``FINE``; or ``USED_UP``, and then nothing has been done; or ``NOT_FINITE`` or ``DIVERGED``, and then no
         value has been changed
     """
@@ -279,7 +291,6 @@ def learn(desk, observations, rewards, ended, rates):
         return USED_UP
     uniforms = desk.uniforms[desk.taken[0]]
     desk.taken[0] += 1
-    learning_rate, trace_decay, rate = rates
     values, visited, row_points, row_slots = desk.values, desk.visited, desk.row_points, desk.row_slots
     live_points, live, live_slots, counts, pace = (
         desk.live_points,
@@ -319,7 +330,7 @@ def learn(desk, observations, rewards, ended, rates):
             else:
                 read_live_row(live, place, pace, row)
                 for block in range(n_blocks):
-                    value += probability * row[best_action(row, blocks[block], blocks[block + 1])] / n_blocks
+                    value += probability * largest(row, blocks[block], blocks[block + 1]) / n_blocks
             squares += probability * probability
         error = rewards[env] + desk.gamma * worth - value
         corrections[env] = learning_rate * error / squares if desk.normalized else learning_rate * error
@@ -366,8 +377,8 @@ def learn(desk, observations, rewards, ended, rates):
 @cache
 def _learn_at(kind):
     @jit
-    def learn_at(address, observations, rewards, ended, rates):
-        return learn(desk_at(address, kind), observations, rewards, ended, rates)
+    def learn_at(address, observations, rewards, ended, learning_rate, trace_decay, rate):
+        return learn(desk_at(address, kind), observations, rewards, ended, learning_rate, trace_decay, rate)
 
     return learn_at
 

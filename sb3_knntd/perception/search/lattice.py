@@ -16,8 +16,9 @@ from sb3_knntd.perception.search.base import Neighbors, Search
 
 class LatticeSearch(Search):
     """
-    Takes the nearest points out of a heap in order of distance: O(k D (D + log kD)) for D dimensions, exact, on
-    the CPU. See :func:`sb3_knntd.kernels.nearest.nearest_on_lattice`.
+    Merges the coordinates of one dimension after the other into a list of the nearest points: O(k D r) for D
+    dimensions, of each of which up to r coordinates are at a time in question, exact, on the CPU. See
+    :func:`sb3_knntd.kernels.nearest.nearest_on_lattice`.
     """
 
     def __init__(self, points: Points, n_neighbors: int) -> None:
