@@ -8,6 +8,8 @@ import sys
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
+from math import isfinite
+from statistics import fmean
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -17,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule, safe_mean
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_knntd.checks import check_number, check_schedule, check_word
 from sb3_knntd.compiled_learner import CompiledLearner
@@ -32,7 +34,7 @@ from sb3_knntd.rules import ActionRule
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
-NO_ENDINGS: tuple[list[int], np.ndarray] = [], np.empty(0)
+NONE_TRUNCATED: dict[int, np.ndarray] = {}
 
 
 class KNNAlgorithm(BaseAlgorithm):
@@ -368,16 +370,15 @@ class KNNAlgorithm(BaseAlgorithm):
         self._current_progress_remaining = progress_remaining(self.num_timesteps, self._total_timesteps)
         try:
             ended = dones.tolist()
-            truncated, last_obs = self._endings(ended, infos) if True in ended else NO_ENDINGS
+            truncated = self._truncated(ended, infos) if True in ended else NONE_TRUNCATED
             if self._measuring:
-                self._measure(new_obs, rewards, last_obs)  # type: ignore[arg-type]
+                self._measure(new_obs, rewards, truncated)  # type: ignore[arg-type]
             else:
                 self._last_actions = self.learner.learn(
                     new_obs,  # type: ignore[arg-type]
                     rewards,
                     dones,
                     truncated,
-                    last_obs,
                     self._rates(),
                 )
         except (ValueError, FloatingPointError) as error:
@@ -419,17 +420,17 @@ class KNNAlgorithm(BaseAlgorithm):
         return self._last_actions
 
     @staticmethod
-    def _endings(ended: list[bool], infos: list[dict[str, Any]]) -> tuple[list[int], np.ndarray]:
-        """Which episodes ended by a time limit, and their last observations; all that ended must be finite."""
-        truncated, last_observations = [], []
+    def _truncated(ended: list[bool], infos: list[dict[str, Any]]) -> dict[int, np.ndarray]:
+        """The last observations of the episodes that a time limit ended; all that ended must be finite."""
+        truncated = {}
         for index, info in enumerate(infos):
             if ended[index] and "terminal_observation" in info:
                 last = np.asarray(info["terminal_observation"])
-                check_finite("a last observation", last[None], [index])
+                if not all(map(isfinite, last.ravel().tolist())):
+                    check_finite("a last observation", last[None], [index])
                 if info.get("TimeLimit.truncated", False):
-                    truncated.append(index)
-                    last_observations.append(last)
-        return truncated, np.array(last_observations)
+                    truncated[index] = last
+        return truncated
 
     # -------------------------------------------- the range of open dimensions
 
@@ -440,10 +441,10 @@ class KNNAlgorithm(BaseAlgorithm):
         n_actions = self.policy.table.n_actions
         return (self._stream.next()[:, 0, 0] * n_actions).astype(np.int64)
 
-    def _measure(self, observations: np.ndarray, rewards: np.ndarray, last_observations: np.ndarray) -> None:
+    def _measure(self, observations: np.ndarray, rewards: np.ndarray, truncated: dict[int, np.ndarray]) -> None:
         check_transition(observations, rewards)
-        if len(last_observations):
-            observations = np.concatenate((observations, last_observations))
+        if truncated:
+            observations = np.concatenate((observations, list(truncated.values())))
         self.policy.perceiver.measure(th.from_numpy(observations).to(self.device))
         self._n_measured += self.n_envs
         self._measuring = self._must_measure()
@@ -478,10 +479,10 @@ class KNNAlgorithm(BaseAlgorithm):
         record("time/time_elapsed", int(elapsed), exclude="tensorboard")
         record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         if len(self.ep_info_buffer) > 0:
-            record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
-            record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
+            record("rollout/ep_rew_mean", fmean(info["r"] for info in self.ep_info_buffer))
+            record("rollout/ep_len_mean", fmean(info["l"] for info in self.ep_info_buffer))
         if len(self.ep_success_buffer) > 0:
-            record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+            record("rollout/success_rate", fmean(self.ep_success_buffer))
         for key, value in self.learner.summary().items():
             record(f"train/{key}", value)
         record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))

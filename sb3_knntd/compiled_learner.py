@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch as th
 
 from sb3_knntd.kernels import step as kernel
 from sb3_knntd.kernels.desk import set_desk
+from sb3_knntd.kernels.step import FINE, FULL, USED_UP
 from sb3_knntd.learner import DIVERGENCE, Form, Learner, Rates, check_finite, check_transition
 from sb3_knntd.memory import LiveStore, QTable
 from sb3_knntd.perception import Perceiver
@@ -41,7 +43,6 @@ class CompiledLearner(Learner):
         self._rule = rule.kernel_arguments()
         self._form = tuple(form)
         k, obs_dim = perceiver.search.n_neighbors, perceiver.bounds.obs_dim
-        self._most_new_points = n_envs * k
         self._indices = np.zeros((3, n_envs, k), np.int64)
         self._probabilities = np.zeros((3, n_envs, k))
         n_blocks = len(rule.blocks) - 1
@@ -64,34 +65,33 @@ class CompiledLearner(Learner):
             self._held,
             self._lengths,
         )
-        self._sums = np.zeros(2)
-        self._n_sums = 0
-        corrections, places = np.zeros(n_envs), np.zeros((n_envs, k), np.int64)
-        self._work = self._sums, np.zeros((2, table.n_actions)), corrections, places
+        self._sums = np.zeros(3)
+        self._places = np.zeros((n_envs, k), np.int64)
+        self._work = self._sums, np.zeros((2, table.n_actions)), np.zeros(n_envs), self._places
         self._set_desk()
 
     def _set_desk(self) -> None:
-        """Take up perception and memory as they are now, and reckon for how many steps there is room."""
+        """Take up perception and memory as they are now."""
         self._eyes = self.perceiver.eyes
         memory, chance = self.live.memory(), (self.stream.rows, self.stream.taken)
         # A desk does not keep its arrays. All others are in attributes of their own.
         self._lent = memory, chance
         self._desk = set_desk(self._eyes, self._rule, self._form, self._episodes, memory, chance, self._work)
         self._learn = kernel.learn_on(self._desk)
-        self._steps_of_room = min(self.live.room, self.table.room) // self._most_new_points
 
     def _make_room(self) -> None:
-        changed = self.table.reserve(self._most_new_points)
-        if self.live.reserve(self._most_new_points) or changed:
+        most_new_points = self._places.size
+        changed = self.table.reserve(most_new_points)
+        if self.live.reserve(most_new_points) or changed:
             self._set_desk()
-        self._steps_of_room = min(self.live.room, self.table.room) // self._most_new_points
 
     def begin(self, observations: np.ndarray, rate: float) -> np.ndarray:
         check_finite("an observation", observations, range(self.n_envs))
         self.live.clear()
         self._set_desk()
         seen = as_rows(observations)
-        self._find(seen, kernel.NOW)
+        if self.perceiver.search_is_outside:
+            self._find(seen, kernel.NOW)
         kernel.begin(self._desk, seen, self.stream.next()[:, 0], rate)
         self.in_episodes = True
         return self._actions
@@ -101,36 +101,33 @@ class CompiledLearner(Learner):
         observations: np.ndarray,
         rewards: np.ndarray,
         ended: np.ndarray,
-        truncated: list[int],
-        last_observations: np.ndarray,
+        truncated: Mapping[int, np.ndarray],
         rates: Rates,
     ) -> np.ndarray:
         if self.perceiver.eyes is not self._eyes:
             self._set_desk()
-        if self._steps_of_room == 0:
-            self._make_room()
-        self._steps_of_room -= 1
         self.live.is_published = False
         seen = observations if observations.dtype is FLOAT32 and observations.ndim == 2 else as_rows(observations)
         if self.perceiver.search_is_outside:
             check_transition(observations, rewards)
             self._find(seen, kernel.THEN)
         if truncated:
-            self._truncated[truncated] = True
-            self._last_observations[truncated] = as_rows(last_observations)
-            self._find(self._last_observations[truncated], kernel.LAST, truncated)
+            self._take_in(truncated)
         # One by one, which numba takes in a quarter of a microsecond sooner than their tuple.
         alpha, trace_decay, rate = rates
         answer = self._learn(seen, rewards, ended, alpha, trace_decay, rate)
-        if answer == kernel.USED_UP:
-            self.stream.refill()
+        while answer != FINE:
+            if answer == USED_UP:
+                self.stream.refill()
+            elif answer == FULL:
+                self._make_room()
+            else:
+                self._truncated[:] = False
+                check_transition(observations, rewards)
+                raise FloatingPointError(DIVERGENCE)
             answer = self._learn(seen, rewards, ended, alpha, trace_decay, rate)
         if truncated:
             self._truncated[:] = False
-        if answer != kernel.FINE:
-            check_transition(observations, rewards)
-            raise FloatingPointError(DIVERGENCE)
-        self._n_sums += self.n_envs
         return self._actions
 
     @property
@@ -138,11 +135,10 @@ class CompiledLearner(Learner):
         return self.live.count
 
     def summary(self) -> dict[str, float]:
-        if not self._n_sums:
+        if not self._sums[2]:
             return {}
-        td_error, q_mean = (self._sums / self._n_sums).tolist()
+        td_error, q_mean = (self._sums[:2] / self._sums[2]).tolist()
         self._sums[:] = 0.0
-        self._n_sums = 0
         return {"td_error": td_error, "q_mean": q_mean}
 
     def state_dict(self) -> dict[str, Any]:
@@ -167,12 +163,19 @@ class CompiledLearner(Learner):
             self.live.set_state(state_dict["traces"])
         self._set_desk()
 
+    def _take_in(self, truncated: Mapping[int, np.ndarray]) -> None:
+        for env, last_observation in truncated.items():
+            self._truncated[env] = True
+            self._last_observations[env] = last_observation
+        if self.perceiver.search_is_outside:
+            envs = list(truncated)
+            self._find(self._last_observations[envs], kernel.LAST, envs)
+
     def _find(self, observations: np.ndarray, state: int, rows: Any = slice(None)) -> None:
         """Have the neighbours found by a search that the kernel does not have in it."""
-        if self.perceiver.search_is_outside:
-            neighbors = self.perceiver.find(th.from_numpy(observations))
-            self._indices[state, rows] = neighbors.indices.numpy()
-            self._probabilities[state, rows] = neighbors.squared_distances.numpy()
+        neighbors = self.perceiver.find(th.from_numpy(observations))
+        self._indices[state, rows] = neighbors.indices.numpy()
+        self._probabilities[state, rows] = neighbors.squared_distances.numpy()
 
 
 def as_rows(observations: np.ndarray) -> np.ndarray:

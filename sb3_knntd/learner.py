@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,8 +63,7 @@ class Learner(ABC):
         observations: np.ndarray,
         rewards: np.ndarray,
         ended: np.ndarray,
-        truncated: list[int],
-        last_observations: np.ndarray,
+        truncated: Mapping[int, np.ndarray],
         rates: Rates,
     ) -> np.ndarray:
         """
@@ -74,8 +73,8 @@ class Learner(ABC):
             (n_envs, *obs_shape)
         :param rewards: shape (n_envs,)
         :param ended: whether the episode ended, shape (n_envs,), bool
-        :param truncated: the environments whose episode ended by a time limit, rising
-        :param last_observations: the true last observation of each of these, shape (len(truncated), *obs_shape)
+        :param truncated: the environments whose episode ended by a time limit, and the true last observation of each of
+            these, shape obs_shape
         :param rates: the scheduled parameters
         :return: the action to take in each environment: its index, shape (n_envs,), int64, or a vector, shape
             (n_envs, action_dim); it holds until the next call
@@ -201,8 +200,7 @@ class TorchLearner(Learner):
         observations: np.ndarray,
         rewards: np.ndarray,
         ended: np.ndarray,
-        truncated: list[int],
-        last_observations: np.ndarray,
+        truncated: Mapping[int, np.ndarray],
         rates: Rates,
     ) -> np.ndarray:
         uniforms = self.stream.next()
@@ -213,8 +211,9 @@ class TorchLearner(Learner):
         perception, choice = self._choose(observations, uniforms[:, 0], rates[2], self.held)
         worth = choice.values * self._tensor(~ended)
         if truncated:
-            _, last = self._choose(last_observations, uniforms[truncated, 1], rates[2], held[truncated])
-            worth[truncated] = last.values
+            envs, last_observations = list(truncated), np.array(list(truncated.values()))
+            _, last = self._choose(last_observations, uniforms[envs, 1], rates[2], held[envs])
+            worth[envs] = last.values
 
         value = self._value()
         errors = self._tensor(rewards).to(worth.dtype) + self.form.gamma * worth - value

@@ -19,7 +19,7 @@ episodes       indices, probabilities (3, n_envs, k), entries (3, n_envs, k, n_b
 memory         the arrays of :mod:`sb3_knntd.kernels.memory`
 chance         uniforms (n_rows, n_envs, 2, n_uniforms): rows of random numbers in [0, 1), for the next action and for
                the one that would have been taken at a truncation; taken (1,): how many of the rows have been
-log            sums of the TD errors' sizes and of the values, (2,)
+log            sums of the TD errors' sizes and of the values, and how many of each, (3,)
 work           means (2, n_actions), corrections (n_envs,), places (n_envs, k), to be used
 """
 

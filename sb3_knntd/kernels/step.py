@@ -31,9 +31,9 @@ GREEDY, UNDRAWN = -1, -2
 
 #: Which state's arrays.
 NOW, THEN, LAST = 0, 1, 2
-#: What :func:`learn` answers: all is well, there are no more random numbers, the environments' numbers are not finite,
-#: or the table's are not.
-FINE, USED_UP, NOT_FINITE, DIVERGED = 0, 1, 2, 3
+#: What :func:`learn` answers: all is well, there are no more random numbers or there is no room for the points that it
+#: may come upon, the environments' numbers are not finite, or the table's are not.
+FINE, USED_UP, FULL, NOT_FINITE, DIVERGED = 0, 1, 2, 3, 4
 
 
 @jit
@@ -284,13 +284,9 @@ def learn(desk, observations, rewards, ended, learning_rate, trace_decay, rate):
     :param learning_rate: α
     :param trace_decay: λ
     :param rate: ε or the temperature
-    :return: ``FINE``; or ``USED_UP``, and then nothing has been done; or ``NOT_FINITE`` or ``DIVERGED``, and then no
-        value has been changed
+    :return: ``FINE``; or ``USED_UP`` or ``FULL``, and then nothing has been done; or ``NOT_FINITE`` or ``DIVERGED``,
+        and then no value has been changed
     """
-    if desk.taken[0] == len(desk.uniforms):
-        return USED_UP
-    uniforms = desk.uniforms[desk.taken[0]]
-    desk.taken[0] += 1
     values, visited, row_points, row_slots = desk.values, desk.visited, desk.row_points, desk.row_slots
     live_points, live, live_slots, counts, pace = (
         desk.live_points,
@@ -304,6 +300,13 @@ def learn(desk, observations, rewards, ended, learning_rate, trace_decay, rate):
     _, n_envs, k, n_blocks = entries.shape
     size, value_sum = 0.0, 0.0
 
+    if desk.taken[0] == len(desk.uniforms):
+        return USED_UP
+    most = n_envs * k
+    if len(live_points) - counts[1] < most or (len(row_slots) > 0 and len(values) - counts[0] < most):
+        return FULL
+    uniforms = desk.uniforms[desk.taken[0]]
+    desk.taken[0] += 1
     count_steps(desk.lengths, ended)
     for env in range(n_envs):
         if not np.isfinite(rewards[env]):
@@ -363,6 +366,7 @@ def learn(desk, observations, rewards, ended, learning_rate, trace_decay, rate):
 
     desk.sums[0] += size
     desk.sums[1] += value_sum
+    desk.sums[2] += n_envs
     for env in range(n_envs):
         for j in range(actions.shape[2]):
             actions[NOW, env, j] = actions[THEN, env, j]

@@ -50,11 +50,6 @@ class LiveStore:
         """
         return (*self.table.arrays(), self.points, self.entries, self.slots, self.table.counts, self.pace)
 
-    @property
-    def room(self) -> int:
-        """How many more points may come to life before :meth:`reserve` has to be called."""
-        return len(self.points) - self.count
-
     def reserve(self, n_points: int) -> bool:
         """
         Make room.
@@ -62,7 +57,7 @@ class LiveStore:
         :param n_points: how many points may come to life in the next step
         :return: whether the arrays have been replaced
         """
-        if self.room >= n_points:
+        if len(self.points) - self.count >= n_points:
             return False
         values, _, _, row_slots, _, points, entries, slots, counts, pace = self.memory()
         settle(values, row_slots, points, entries, slots, counts, pace)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
@@ -89,11 +88,6 @@ class QTable(nn.Module, ABC):
         :return: their values, up to date, shape (batch, k, n_actions)
         """
 
-    @property
-    @abstractmethod
-    def room(self) -> int:
-        """How many more points may be learned at before :meth:`reserve` has to be called."""
-
     @abstractmethod
     def reserve(self, n_points: int) -> bool:
         """
@@ -173,10 +167,6 @@ class DenseTable(QTable):
         self.sync()
         return self.values[indices]
 
-    @property
-    def room(self) -> int:
-        return sys.maxsize
-
     def reserve(self, n_points: int) -> bool:
         return False
 
@@ -241,12 +231,8 @@ class HashedTable(QTable):
         rows = th.from_numpy(found).reshape(indices.shape)
         return th.where((rows >= 0)[..., None], self.values[rows.clamp(min=0)], self.initial_value)
 
-    @property
-    def room(self) -> int:
-        return len(self.values) - self.n_visited
-
     def reserve(self, n_points: int) -> bool:
-        if self.room >= n_points:
+        if len(self.values) - self.n_visited >= n_points:
             return False
         self._resize(max(2 * len(self.values), self.n_visited + n_points))
         return True
