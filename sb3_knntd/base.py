@@ -186,9 +186,8 @@ class KNNAlgorithm(BaseAlgorithm):
         self._check_parameters()
         self._setup_lr_schedule()
         self.trace_schedule = FloatSchedule(self.trace_decay)
-        # Most keep both as they are, and a call more is felt in steps this short.
-        alpha, trace_decay = self.learning_rate, self.trace_decay
-        self._constant_rates = None if callable(alpha) or callable(trace_decay) else (alpha, trace_decay)
+        # What stays as it is need not be asked for: a call more is felt in steps this short.
+        self._constant_rates = [None if callable(rate) else rate for rate in (self.learning_rate, self.trace_decay)]
         self.exploration_schedule = self._make_exploration_schedule()
         normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
@@ -410,7 +409,11 @@ class KNNAlgorithm(BaseAlgorithm):
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
         self.exploration_rate = rate = self.exploration_schedule(progress)
-        alpha, trace_decay = self._constant_rates or (self.lr_schedule(progress), self.trace_schedule(progress))
+        alpha, trace_decay = self._constant_rates
+        if alpha is None:
+            alpha = self.lr_schedule(progress)
+        if trace_decay is None:
+            trace_decay = self.trace_schedule(progress)
         return alpha, trace_decay, rate
 
     def _first_actions(self) -> np.ndarray:
