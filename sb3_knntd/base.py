@@ -369,7 +369,8 @@ class KNNAlgorithm(BaseAlgorithm):
         self._current_progress_remaining = progress_remaining(self.num_timesteps, self._total_timesteps)
         try:
             ended = dones.tolist()
-            truncated = self._truncated(ended, infos) if True in ended else NONE_TRUNCATED
+            any_ended = True in ended
+            truncated = self._truncated(ended, infos) if any_ended else NONE_TRUNCATED
             if self._measuring:
                 self._measure(new_obs, rewards, truncated)  # type: ignore[arg-type]
             else:
@@ -387,7 +388,7 @@ class KNNAlgorithm(BaseAlgorithm):
             raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
         self._last_obs = new_obs  # type: ignore[assignment]
         n_logs = 0
-        if True in ended:
+        if any_ended:
             self._update_info_buffer(infos, dones)
             before = self._episode_num
             self._episode_num += ended.count(True)
@@ -482,8 +483,8 @@ class KNNAlgorithm(BaseAlgorithm):
         record("time/time_elapsed", int(elapsed), exclude="tensorboard")
         record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         if len(self.ep_info_buffer) > 0:
-            record("rollout/ep_rew_mean", fmean(info["r"] for info in self.ep_info_buffer))
-            record("rollout/ep_len_mean", fmean(info["l"] for info in self.ep_info_buffer))
+            record("rollout/ep_rew_mean", fmean([info["r"] for info in self.ep_info_buffer]))
+            record("rollout/ep_len_mean", fmean([info["l"] for info in self.ep_info_buffer]))
         if len(self.ep_success_buffer) > 0:
             record("rollout/success_rate", fmean(self.ep_success_buffer))
         for key, value in self.learner.summary().items():

@@ -142,7 +142,7 @@ class DenseTable(QTable):
 
     @property
     def n_visited(self) -> int:
-        return int(np.unpackbits(self.visited[:-1].cpu().numpy()).sum())
+        return int(np.unpackbits(self.visited.cpu().numpy()[:-1]).sum())
 
     def visit(self, indices: th.Tensor) -> None:
         """
