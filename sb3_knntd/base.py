@@ -430,6 +430,7 @@ class KNNAlgorithm(BaseAlgorithm):
         for index, info in enumerate(infos):
             if ended[index] and "terminal_observation" in info:
                 last = np.asarray(info["terminal_observation"])
+                # Sooner than NumPy with few numbers, which only says where when there is something to say.
                 if not all(map(isfinite, last.ravel().tolist())):
                     check_finite("a last observation", last[None], [index])
                 if info.get("TimeLimit.truncated", False):

@@ -84,9 +84,9 @@ def greedy_action(values, first, end, uniform, random_ties):
 
 @jit
 def _softmax(values, temperature, shares):
-    largest, total = values[best_action(values, 0, len(values))], 0.0
+    best, total = largest(values, 0, len(values)), 0.0
     for action in range(len(values)):
-        shares[action] = np.exp((values[action] - largest) / temperature)
+        shares[action] = np.exp((values[action] - best) / temperature)
         total += shares[action]
     for action in range(len(values)):
         shares[action] /= total
@@ -122,14 +122,14 @@ def choose(values, uniforms, rate, target, exploration, random_ties, shares):
 
     if target == SARSA:
         return action, values[action]
-    largest = values[best_action(values, 0, n_actions)]
+    best = largest(values, 0, n_actions)
     if target == Q_LEARNING:
-        return action, largest
+        return action, best
     worth = 0.0
     if exploration == EPSILON_GREEDY:
         for candidate in range(n_actions):
             worth += values[candidate]
-        return action, (1.0 - rate) * largest + rate * (worth / n_actions)
+        return action, (1.0 - rate) * best + rate * (worth / n_actions)
     for candidate in range(n_actions):
         worth += shares[candidate] * values[candidate]
     return action, worth
