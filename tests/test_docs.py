@@ -73,15 +73,14 @@ def test_pages_are_found() -> None:
 
 
 @pytest.mark.parametrize("page", RUNNING, ids=name_of)
-def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    # One after the other in one namespace, as a reader would type them.
-    names: dict[str, Any] = {"__name__": "__main__"}
+def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
+    # One after the other in a program of its own, as a reader would type them; a traceback names the line of the page.
+    program = ""
     for block in blocks(page, "python"):
         assert block.map is not None
-        # So that a traceback names the line of the page.
-        code = "\n" * (block.map[0] + 1) + block.content
-        exec(compile(code, str(page), "exec"), names)
+        program += "\n" * (block.map[0] + 1 - program.count("\n")) + block.content
+    run = subprocess.run([sys.executable, "-"], input=program, cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
 
 
 class ArgumentsReadError(Exception):
