@@ -64,10 +64,11 @@ def connect(address: str | None = None, log_to_driver: bool = False) -> bool:
     """
     if ray.is_initialized():
         return False
-    is_there = address or os.environ.get("RAY_ADDRESS")
+    # Given nothing, Ray itself would take whichever cluster was started last on this machine.
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
     ray.init(
         address,
-        include_dashboard=None if is_there else False,
+        include_dashboard=False if address == "local" else None,
         log_to_driver=log_to_driver,
         logging_level=logging.WARNING,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import pathlib
+import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -22,6 +23,12 @@ from sb3_knntd import KNNTD, ExA
 
 # Every operation here is tiny: more threads only wait for each other, the more so under pytest-xdist.
 th.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """SB3's loggers leave a folder for each model: where pytest tidies up."""
+    tempfile.tempdir = str(tmp_path_factory.mktemp("temporary"))
 
 
 @pytest.fixture

@@ -490,6 +490,14 @@ def test_ray_is_imported_only_when_needed(monkeypatch: pytest.MonkeyPatch) -> No
         importlib.import_module("sb3_knntd.ray_vec_env")
 
 
+def test_given_no_cluster_it_starts_its_own(cluster: Cluster) -> None:
+    program = "import ray; from sb3_knntd.ray_jobs import connect; print(connect(), ray.cluster_resources())"
+    environ = {key: value for key, value in os.environ.items() if key != "RAY_ADDRESS"}
+    done = subprocess.run([sys.executable, "-c", program], env=environ, timeout=300, capture_output=True, text=True)
+    assert done.stdout.startswith("True {"), done.stderr[-3000:]
+    assert "simulator" not in done.stdout
+
+
 ELSEWHERE = """
 import sys, warnings, os, signal, numpy as np, ray
 from ray_envs import MortalEnv
