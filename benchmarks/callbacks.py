@@ -12,6 +12,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +29,10 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from benchmarks.machine import describe
 from sb3_knntd import KNNTD
+from sb3_knntd.audience import Audience
 
 ENV_ID = "MountainCar-v0"
+TOGETHER = "all five together"
 #: Steps that a time of a step is taken over.
 STEPS = 20_000
 
@@ -46,7 +49,7 @@ class Row(NamedTuple):
     One line of the table.
 
     :param name: of the callback
-    :param call: microseconds of a call that finds nothing to do, the whole of what SB3 does at a step included
+    :param call: microseconds that it takes to tell it of a step at which it has nothing to do
     :param call_share: the same as a share of a step without callbacks
     :param act: seconds of one act, the mean; ``None`` for callbacks without any
     :param act_share: share of the time spent on acting, but for the one at the end of training
@@ -99,7 +102,7 @@ def call_seconds(callback: BaseCallback, folder: Path, repeats: int) -> float:
     :param callback: any
     :param folder: where TensorBoard's log goes
     :param repeats: the best of so many
-    :return: seconds of the processor that a step's calls of it take when there is nothing to do
+    :return: seconds of the processor that it takes to tell it of a step, when it has nothing to do
     """
     seen: dict[str, Any] = {}
 
@@ -112,16 +115,21 @@ def call_seconds(callback: BaseCallback, folder: Path, repeats: int) -> float:
     model.learn(150, callback=see)
     callback.init_callback(model)
     callback.on_training_start(seen, {})
-    if hasattr(callback, "_act"):
-        callback._act = lambda: None
+    for each in getattr(callback, "callbacks", [callback]):
+        if hasattr(each, "_act"):
+            each._act = lambda: None
+    audience, observations = Audience(callback), seen["new_obs"]
     times = []
     for _ in range(repeats):
         start = time.process_time()
         for _ in range(STEPS):
-            callback.on_rollout_start()
-            callback.update_locals(seen)
-            callback.on_step()
-            callback.on_rollout_end()
+            # What the algorithm does about its callbacks in a step.
+            for listener in audience.listeners:
+                listener.on_rollout_start()
+            if audience.hears(observations, False):
+                audience.tell(dict(seen), model.num_timesteps)
+            for listener in audience.listeners:
+                listener.on_rollout_end()
         times.append((time.process_time() - start) / STEPS)
     return min(times)
 
@@ -188,13 +196,18 @@ def measure(seconds: float, repeats: int) -> tuple[float, list[Row]]:
         folder = Path(name)
         step = step_seconds(repeats)
         acted, lasted = acts(folder / "together", seconds)
+        nobody = call_seconds(CallbackList([]), folder, repeats)
+        all_together = CallbackList([*make_callbacks(folder).values()])
         rows = []
-        for each, callback in {"SB3's least callback": Nothing(), **make_callbacks(folder)}.items():
-            call = call_seconds(callback, folder, repeats)
-            spent = acted.get(each, [])
-            rows.append(
-                Row(each, 1e6 * call, call / step, statistics.mean(spent) if spent else None, sum(spent) / lasted)
-            )
+        for each, callback in {
+            "SB3's least callback": Nothing(),
+            **make_callbacks(folder),
+            TOGETHER: all_together,
+        }.items():
+            call = call_seconds(callback, folder, repeats) - nobody
+            spent = [*chain(*acted.values())] if each == TOGETHER else acted.get(each, [])
+            act = statistics.mean(spent) if spent and each != TOGETHER else None
+            rows.append(Row(each, 1e6 * call, call / step, act, sum(spent) / lasted))
         return step, rows
 
 

@@ -34,8 +34,8 @@ class EpisodeVideoCallback(PacedCallback):
 
     :param eval_env: where the episode takes place, with ``render_mode="rgb_array"``: another environment than that
         of training, wrapped in the same wrappers. VecNormalize gets the statistics of training, as in EvalCallback
-    :param video_freq: record every so many calls (of n_envs steps each); ``None``: as often as takes half a percent
-        of the time, which is once in some minutes
+    :param video_freq: record every so many calls (of n_envs steps each); ``None``: as often as takes a thousandth of
+        the time, which is once in half an hour or so
     :param folder: where to write ``episode_{steps}.gif``; ``None`` for no files
     :param max_steps: an episode is recorded up to this step
     :param verbose: 1 for a line whenever a file is written

@@ -45,20 +45,22 @@ class Footprints:
 
     def begin(self, observations: np.ndarray) -> None:
         """
-        Training begins, with a new route. Nothing may wait to be counted.
+        Training begins, with a new route. What waits to be counted of one that was broken off is forgotten.
 
         :param observations: where the environments are, shape (n_envs, obs_dim)
         """
+        self.recent.clear()
+        self._ends.clear()
         self._route.clear()
         self._route.append(observations[:1])
 
     def end_route(self, last_observation: np.ndarray) -> None:
         """
-        The episode of the first environment has ended, and what it shows now has not been appended yet.
+        The episode of the first environment has ended with the step that was appended last.
 
         :param last_observation: the last of the episode, shape (obs_dim,)
         """
-        self._ends.append((len(self.recent), last_observation))
+        self._ends.append((len(self.recent) - 1, last_observation))
 
     def count(self, extent: Extent) -> None:
         """

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import HParam
+
+from sb3_knntd.audience import PatientCallback
 
 from .paced import picture_formats, write
 
@@ -19,7 +21,7 @@ LEFT_OUT = {"self", "policy", "env", "policy_kwargs", "tensorboard_log", "verbos
 LONGEST = 60
 
 
-class HParamCallback(BaseCallback):
+class HParamCallback(PatientCallback):
     """
     Writes the arguments that the model was made with to TensorBoard's HParams, when training begins. The metrics beside
     them are scalars that the run logs.
@@ -42,6 +44,7 @@ class HParamCallback(BaseCallback):
         self.metrics = tuple(metrics)
 
     def _on_training_start(self) -> None:
+        self.due_at = sys.maxsize
         outputs = picture_formats(self.logger)
         if not outputs:
             raise ValueError("HParamCallback writes to TensorBoard: give the model tensorboard_log")

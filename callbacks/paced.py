@@ -6,22 +6,22 @@ import time
 from abc import abstractmethod
 from typing import Any, ClassVar
 
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, HumanOutputFormat, JSONOutputFormat, KVWriter, Logger
 
+from sb3_knntd.audience import PatientCallback
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.checks import check_integer
 
 #: ``freq=None``: calls between two looks at the clock.
-CALLS_BETWEEN_LOOKS = 16
+CALLS_BETWEEN_LOOKS = 128
 
 
-class PacedCallback(BaseCallback):
+class PacedCallback(PatientCallback):
     """
     Acts now and then, and when training ends.
 
     :param name: name of the argument that ``freq`` was given as
-    :param freq: act every ``freq`` calls (of n_envs steps each); ``None``: as often as takes half a percent of the time
+    :param freq: act every ``freq`` calls (of n_envs steps each); ``None``: as often as takes :attr:`SHARE` of the time
     :param verbose: 0 for no output, 1 for a line whenever a file is written
     :raises ValueError: if ``freq`` is neither ``None`` nor an integer >= 1
     """
@@ -29,7 +29,7 @@ class PacedCallback(BaseCallback):
     model: KNNAlgorithm
 
     #: ``freq=None``: the share of the time that is spent on acting.
-    SHARE: ClassVar[float] = 0.005
+    SHARE: ClassVar[float] = 0.001
     #: Seconds that the first act is taken to last.
     FIRST_SECONDS: ClassVar[float]
 
@@ -51,50 +51,29 @@ class PacedCallback(BaseCallback):
         self._seconds = self.FIRST_SECONDS
         self._spent = 0.0
         self._start = time.perf_counter()
-        self._look_at = self._next_look()
-
-    # A step takes some 30 µs, and what SB3 does around _on_step is felt. So on_step itself does as little as it can.
-
-    def on_step(self) -> bool:
-        self.n_calls += 1
-        if self.n_calls >= self._look_at:
-            self._look()
-        return True
-
-    def _look(self) -> None:
-        self.num_timesteps = self.model.num_timesteps
-        self._on_step()
-        self._look_at = self._next_look()
-
-    def update_locals(self, locals_: dict[str, Any]) -> None:
-        self.locals = locals_
-
-    def on_rollout_start(self) -> None:
-        """Nothing to do."""
-
-    def on_rollout_end(self) -> None:
-        """Nothing to do."""
+        self.due_at = self._next_due()
 
     def _on_step(self) -> bool:
-        if self.freq is None:
-            due = (time.perf_counter() - self._start) * self.SHARE >= self._spent + self._seconds
-        else:
-            due = self.n_calls % self.freq == 0
-        if due:
+        if self._is_time():
             start = time.perf_counter()
             self._acted_at = self.n_calls
             self._act()
             self._seconds = time.perf_counter() - start
             self._spent += self._seconds
+        self.due_at = self._next_due()
         return True
 
-    def _next_look(self) -> int:
+    def _is_time(self) -> bool:
+        if self.freq is None:
+            return (time.perf_counter() - self._start) * self.SHARE >= self._spent + self._seconds
+        return self.n_calls % self.freq == 0
+
+    def _next_due(self) -> int:
         """The next call at which there may be something to do."""
         return self.n_calls + (CALLS_BETWEEN_LOOKS if self.freq is None else self.freq - self.n_calls % self.freq)
 
     def _on_training_end(self) -> None:
         if self.n_calls > self._acted_at:
-            self.num_timesteps = self.model.num_timesteps
             self._acted_at = self.n_calls
             self._act()
 

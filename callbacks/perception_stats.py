@@ -57,13 +57,14 @@ class PerceptionStatsCallback(PacedCallback):
 
         KNNTD("MountainCar-v0", tensorboard_log="logs").learn(50_000, callback=PerceptionStatsCallback())
 
-    :param log_freq: log every so many calls (of n_envs steps each); ``None``: as often as takes half a percent of the
-        time, which is about once a second
+    :param log_freq: log every so many calls (of n_envs steps each); ``None``: as often as takes two thousandths
+        of the time, which is once in five seconds or so
     :param n_samples: number of transitions that the sample is of, the last ones
     :param verbose: has no effect
     :raises ValueError: if an argument does not fit
     """
 
+    SHARE: ClassVar[float] = 0.002
     FIRST_SECONDS: ClassVar[float] = 0.005
 
     def __init__(self, log_freq: int | None = None, n_samples: int = 256, verbose: int = 0) -> None:
@@ -85,8 +86,8 @@ class PerceptionStatsCallback(PacedCallback):
             self._take()
         return super()._on_step()
 
-    def _next_look(self) -> int:
-        return min(super()._next_look(), self._sample_at)
+    def _next_due(self) -> int:
+        return min(super()._next_due(), self._sample_at)
 
     def _take(self) -> None:
         """Keep the observations, and in the next step what came of them."""

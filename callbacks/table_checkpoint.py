@@ -48,8 +48,8 @@ class TableCheckpointCallback(PacedCallback):
         model.learn(1_000_000 - model.num_timesteps, callback=callback, reset_num_timesteps=False)
 
     :param save_path: folder
-    :param save_freq: save every so many calls (of n_envs steps each); ``None``: as often as takes half a percent of
-        the time, which is every ten seconds or so with a small table
+    :param save_freq: save every so many calls (of n_envs steps each); ``None``: as often as takes a thousandth of
+        the time, which is every half a minute or so with a small table
     :param n_last: how many of the last are kept, >= 1
     :param save_best: whether to keep the best
     :param name_prefix: what the files' names begin with

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -54,8 +54,8 @@ class ValueMapCallback(PacedCallback):
     :param fixed: where to hold other dimensions, observation units (with VecNormalize the normalised ones)
     :param average: what is done with the dimensions that ``fixed`` does not name: held in the middle of their range,
         or averaged over, see :func:`~sb3_knntd.plots.value_grid`
-    :param draw_freq: draw every so many calls (of n_envs steps each); ``None``: as often as takes half a percent of
-        the time, which is once in a minute or so
+    :param draw_freq: draw every so many calls (of n_envs steps each); ``None``: as often as takes a thousandth
+        of the time, which is a few times in an hour
     :param n_routes: how many episodes are drawn, the last ones
     :param resolution: number of cells in each of the two dimensions
     :param folder: where to write ``value_map_{steps}.png``; ``None`` for no files
@@ -107,25 +107,22 @@ class ValueMapCallback(PacedCallback):
         self._footprints.begin(self.model._last_obs)
         super()._on_training_start()
 
-    def on_step(self) -> bool:
-        local = self.locals
-        observations = local["new_obs"]
-        if local["dones"][0]:
-            self._footprints.end_route(last_observation(local["infos"], observations))
-        # Not copied: SB3's algorithms hold on to what a VecEnv returned as well.
-        self._footprints.recent.append(observations)
-        self.n_calls += 1
-        if self.n_calls >= self._look_at:
-            self._look()
-        return True
+    def recorder(self) -> Callable[[np.ndarray], object]:
+        """
+        :return: what takes the observations of every step
+        """
+        return self._footprints.recent.append
 
     def _on_step(self) -> bool:
-        if self._footprints.room == 0:
+        local = self.locals
+        if local["dones"][0]:
+            self._footprints.end_route(last_observation(local["infos"], local["new_obs"]))
+        if self._footprints.room <= 0:
             self._footprints.count(self._extent())
         return super()._on_step()
 
-    def _next_look(self) -> int:
-        return min(super()._next_look(), self.n_calls + self._footprints.room)
+    def _next_due(self) -> int:
+        return min(super()._next_due(), self.n_calls + self._footprints.room)
 
     def _on_training_end(self) -> None:
         super()._on_training_end()

@@ -16,11 +16,12 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
+from sb3_knntd.audience import Audience
 from sb3_knntd.checks import check_number, check_schedule, check_word
 from sb3_knntd.compiled_learner import CompiledLearner
 from sb3_knntd.files import read_description, replacing
@@ -318,12 +319,11 @@ class KNNAlgorithm(BaseAlgorithm):
         )
         self._measuring = self._must_measure()
         callback.on_training_start(locals(), globals())
-        # Telling nobody takes a thirtieth of the time of a step.
-        silent = isinstance(callback, ConvertCallback) and callback.callback is None
-        listener = None if silent else callback
+        audience = Audience(callback)
         while self.num_timesteps < total_timesteps:
-            if not self._step(listener, log_interval):
+            if not self._step(audience, log_interval):
                 break
+        audience.catch_up(self.num_timesteps)
         callback.on_training_end()
         return self
 
@@ -347,18 +347,18 @@ class KNNAlgorithm(BaseAlgorithm):
             self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
         return total_timesteps, callback
 
-    def _step(self, callback: BaseCallback | None, log_interval: int | None) -> bool:
+    def _step(self, audience: Audience, log_interval: int | None) -> bool:
         """
         One step in every environment, and what is learned from it.
 
-        :param callback: who is told, if anybody
+        :param audience: who is told
         :param log_interval: number of episodes between logs
         :return: whether to go on
         """
         env = self.env
         assert env is not None
-        if callback is not None:
-            callback.on_rollout_start()
+        for listener in audience.listeners:
+            listener.on_rollout_start()
         actions = self._last_actions
         if actions is None or self._measuring:
             actions = self._random_actions() if self._measuring else self._first_actions()
@@ -397,14 +397,13 @@ class KNNAlgorithm(BaseAlgorithm):
         if self._adapts and not (self._measuring or self.policy.perceiver.sees(self._last_obs)):  # type: ignore[arg-type]
             self._widen()
 
-        if callback is not None:
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return False
+        # What is seen is handed on and not copied: SB3's algorithms hold on to what a VecEnv returned as well.
+        if audience.hears(new_obs, any_ended) and not audience.tell(locals(), self.num_timesteps):  # type: ignore[arg-type]
+            return False
         if n_logs:
             self.dump_logs()
-        if callback is not None:
-            callback.on_rollout_end()
+        for listener in audience.listeners:
+            listener.on_rollout_end()
         return True
 
     def _rates(self) -> Rates:

@@ -190,26 +190,24 @@ class Ticking(PerceptionStatsCallback):
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, act_seconds: float, step_seconds: float) -> None:
         super().__init__()
-        self.now, self.act_seconds, self.step_seconds = 0.0, act_seconds, step_seconds
         self.acts: list[int] = []
-        monkeypatch.setattr(time, "perf_counter", lambda: self.now)
-
-    def on_step(self) -> bool:
-        self.now += self.step_seconds
-        return super().on_step()
+        monkeypatch.setattr(
+            time,
+            "perf_counter",
+            lambda: self.model.num_timesteps * step_seconds + len(self.acts) * act_seconds,
+        )
 
     def _act(self) -> None:
         self.acts.append(self.n_calls)
-        self.now += self.act_seconds
 
 
-def test_by_default_it_takes_half_a_percent_of_the_time(make_model: MakeModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    callback = Ticking(monkeypatch, act_seconds=0.1, step_seconds=0.05)
-    make_model().learn(2000, callback=callback)
-    # The first is taken to last 5 ms, which a second pays for; but it lasts 0.1 s, and 20 s pay for that.
+def test_by_default_it_takes_its_share_of_the_time(make_model: MakeModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    callback = Ticking(monkeypatch, act_seconds=0.2, step_seconds=0.1)
+    make_model().learn(4500, callback=callback)
+    # Two thousandths: the first is taken to last 5 ms, which 2.5 s pay for; but it lasts 0.2 s, and 100 s pay for that.
     first, *others = callback.acts
-    assert 20 <= first <= 36
-    np.testing.assert_allclose(others, [800, 1200, 1600, 2000], atol=18)
+    assert 25 <= first <= 25 + 128
+    np.testing.assert_allclose(others, [2000, 3000, 4000, 4500], atol=128)
 
 
 def test_nothing_is_done_twice_at_the_end(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
