@@ -25,9 +25,24 @@ def jit(function: Function) -> Function:
     :param function: to be compiled
     :return: the compiled function, or ``function`` itself without numba
     """
+    return _compile(function)
+
+
+def inlined(function: Function) -> Function:
+    """
+    As :func:`jit`, and put in place of every call by compiled functions. For what is called for each neighbour: handing
+    over a dozen arrays takes longer than a glance into them.
+
+    :param function: to be compiled
+    :return: the compiled function, or ``function`` itself without numba
+    """
+    return _compile(function, forceinline=True)
+
+
+def _compile(function: Function, forceinline: bool = False) -> Function:
     if not AVAILABLE:
         return function
     try:
-        return cast(Function, numba.njit(cache=True, nogil=True)(function))
+        return cast(Function, numba.njit(cache=True, nogil=True, forceinline=forceinline)(function))
     except RuntimeError:  # there is no folder that numba may write to
-        return cast(Function, numba.njit(nogil=True)(function))
+        return cast(Function, numba.njit(nogil=True, forceinline=forceinline)(function))

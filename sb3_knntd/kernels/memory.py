@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import jit
+from sb3_knntd.kernels.jit import inlined, jit
 
 #: A trace below this has no weight in a float64 that the trace above it moves; it is let go.
 LEAST_TRACE = 1e-18
@@ -41,7 +41,7 @@ LEAST_TRACE = 1e-18
 LEAST_CLOCK = 1e-4
 
 
-@jit
+@inlined
 def _probe(point, slots):
     """The slot of a point, or the free one where it belongs."""
     mask = len(slots) - 1
@@ -52,7 +52,7 @@ def _probe(point, slots):
     return slot
 
 
-@jit
+@inlined
 def find(point, slots):
     """The place of a point, -1 if it has none."""
     slot = _probe(point, slots)
@@ -75,13 +75,13 @@ def rehash(points, count, slots):
         insert(points[place], place, slots)
 
 
-@jit
+@inlined
 def row_of(point, row_slots):
     """Row of a point in the table, -1 if it has none yet."""
     return point if len(row_slots) == 0 else find(point, row_slots)
 
 
-@jit
+@inlined
 def total(live, place, action, pace):
     """Value of a live entry."""
     n_envs = len(pace) - 1
@@ -93,7 +93,7 @@ def total(live, place, action, pace):
     return live[place, action, n_envs + 1] + live[place, action, n_envs] * gained
 
 
-@jit
+@inlined
 def read_live_row(live, place, pace, row):
     """Write the values of a live point's actions into ``row``, shape (n_actions,)."""
     if len(pace) == 2:
@@ -105,30 +105,21 @@ def read_live_row(live, place, pace, row):
             row[action] = total(live, place, action, pace)
 
 
-@jit
-def read_row(point, values, row_slots, initial, live, live_slots, pace, row):
-    """Write the values of a point's actions into ``row``, shape (n_actions,)."""
-    place = find(point, live_slots)
-    if place >= 0:
-        read_live_row(live, place, pace, row)
-    else:
-        read_stored_row(point, values, row_slots, initial, row)
-
-
-@jit
+@inlined
 def read_stored_row(point, values, row_slots, initial, row):
-    """As :func:`read_row`, from the table alone."""
+    """Write the values of a point's actions into ``row``, shape (n_actions,), from the table alone."""
     place = row_of(point, row_slots)
-    for action in range(len(row)):
-        row[action] = values[place, action] if place >= 0 else initial
+    if place >= 0:
+        for action in range(len(row)):
+            row[action] = values[place, action]
+    else:
+        for action in range(len(row)):
+            row[action] = initial
 
 
 @jit
 def enliven(point, values, visited, row_points, row_slots, live_points, live, live_slots, counts):
-    """The live place of a point, made if it has none, and with it a row of the table."""
-    place = find(point, live_slots)
-    if place >= 0:
-        return place
+    """Make a live place for a point that has none, and with it a row of the table if it has none either."""
     row = row_of(point, row_slots)
     if row < 0:
         row = counts[0]
@@ -150,7 +141,7 @@ def enliven(point, values, visited, row_points, row_slots, live_points, live, li
     return place
 
 
-@jit
+@inlined
 def set_trace(live, place, action, env, trace, pace):
     """Set x of a live entry; its value stays what it is."""
     n_envs = len(pace) - 1

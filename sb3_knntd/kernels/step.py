@@ -7,13 +7,13 @@ from functools import cache, partial
 import numpy as np
 
 from sb3_knntd.kernels.desk import desk_at, place_of
-from sb3_knntd.kernels.jit import jit
+from sb3_knntd.kernels.jit import inlined, jit
 from sb3_knntd.kernels.memory import (
     LEAST_CLOCK,
     end_episode,
     enliven,
+    find,
     read_live_row,
-    read_row,
     read_stored_row,
     set_trace,
     settle,
@@ -36,7 +36,7 @@ NOW, THEN, LAST = 0, 1, 2
 FINE, USED_UP, FULL, NOT_FINITE, DIVERGED = 0, 1, 2, 3, 4
 
 
-@jit
+@inlined
 def pick(uniform, n):
     """One of n, by a uniform random number."""
     return min(np.int64(uniform * n), n - 1)
@@ -52,7 +52,7 @@ def best_action(values, first, end):
     return best
 
 
-@jit
+@inlined
 def largest(values, first, end):
     """The largest value from ``first`` to before ``end``."""
     value = values[first]
@@ -62,7 +62,7 @@ def largest(values, first, end):
     return value
 
 
-@jit
+@inlined
 def greedy_action(values, first, end, uniform, random_ties):
     """The best action from ``first`` to before ``end``, drawn from equals or the first of them."""
     value = largest(values, first, end)
@@ -144,7 +144,11 @@ def choose_average(uniforms, rate, state, env, desk):
     values, row_slots, live, live_slots, pace = desk.values, desk.row_slots, desk.live, desk.live_slots, desk.pace
     means[:] = 0.0
     for i in range(len(indices)):
-        read_row(indices[i], values, row_slots, desk.initial, live, live_slots, pace, row)
+        place = find(indices[i], live_slots)
+        if place >= 0:
+            read_live_row(live, place, pace, row)
+        else:
+            read_stored_row(indices[i], values, row_slots, desk.initial, row)
         for action in range(len(means)):
             means[action] += probabilities[i] * row[action]
     action, worth = choose(means, uniforms, rate, desk.target, desk.exploration, desk.random_ties, row)
@@ -203,7 +207,11 @@ def choose_each(uniforms, rate, state, env, desk):
     actions[:] = 0.0
     worth = 0.0
     for i in range(k):
-        read_row(indices[i], values, row_slots, desk.initial, live, live_slots, pace, row)
+        place = find(indices[i], live_slots)
+        if place >= 0:
+            read_live_row(live, place, pace, row)
+        else:
+            read_stored_row(indices[i], values, row_slots, desk.initial, row)
         for block in range(n_blocks):
             first, end = blocks[block], blocks[block + 1]
             uniform = uniforms[2 + n_blocks + i * n_blocks + block]
@@ -323,9 +331,10 @@ def learn(desk, observations, rewards, ended, learning_rate, trace_decay, rate):
             worth = 0.0
         value, squares = 0.0, 0.0
         for i in range(k):
-            place = enliven(
-                indices[NOW, env, i], values, visited, row_points, row_slots, live_points, live, live_slots, counts
-            )
+            point = indices[NOW, env, i]
+            place = find(point, live_slots)
+            if place < 0:
+                place = enliven(point, values, visited, row_points, row_slots, live_points, live, live_slots, counts)
             places[env, i] = place
             probability = probabilities[NOW, env, i]
             if desk.rule == AVERAGE:
