@@ -18,6 +18,8 @@ from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule
 
 FLOAT32 = np.dtype(np.float32)
+#: What holds addresses of arrays, or looks into them: a copy of the learner makes its own.
+OF_THE_DESK = {"_lent", "_desk", "_learn", "_actions"}
 
 
 class CompiledLearner(Learner):
@@ -50,9 +52,6 @@ class CompiledLearner(Learner):
         self._held = np.full((n_envs, n_blocks), kernel.UNDRAWN)
         self._lengths = np.zeros(1 + n_envs)
         actions = np.zeros((3, n_envs, self._rule[-1].shape[1]))
-        # One action for all neighbours is the column that the first answers for.
-        averages = self._rule[0] == kernel.AVERAGE
-        self._actions: np.ndarray = self._entries[kernel.NOW, :, 0, 0] if averages else actions[kernel.NOW]
         self._truncated = np.zeros(n_envs, np.bool_)
         self._last_observations = np.zeros((n_envs, obs_dim))
         self._episodes = (
@@ -78,6 +77,16 @@ class CompiledLearner(Learner):
         self._lent = memory, chance
         self._desk = set_desk(self._eyes, self._rule, self._form, self._episodes, memory, chance, self._work)
         self._learn = kernel.learn_on(self._desk)
+        # One action for all neighbours is the column that the first answers for.
+        averages, actions = self._rule[0] == kernel.AVERAGE, self._episodes[3]
+        self._actions: np.ndarray = self._entries[kernel.NOW, :, 0, 0] if averages else actions[kernel.NOW]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in OF_THE_DESK}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._set_desk()
 
     def _make_room(self) -> None:
         most_new_points = self._places.size

@@ -156,6 +156,27 @@ def test_interrupted_run_in_normalised_environments(
     assert same_table(resumed, whole)
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"policy_kwargs": {"table": "hashed"}},
+        {"policy_kwargs": {"dtype": th.float32}},
+        {"search": "kd_tree"},
+        {"points": np.random.default_rng(0).uniform(-1.0, 1.0, (50, 2)), "search": "brute"},
+    ],
+)
+def test_a_deep_copy_goes_on_alike_and_for_itself(make_model: MakeModel, arguments: dict[str, Any]) -> None:
+    # Ends within an episode.
+    model = make_model(**arguments).learn(155)
+    before, other = model.policy.q_table.clone(), copy.deepcopy(model)
+    other.learn(200, reset_num_timesteps=False)
+    assert th.equal(model.policy.q_table, before)
+    model.learn(200, reset_num_timesteps=False)
+    assert th.equal(model.policy.q_table, other.policy.q_table)
+    assert not th.equal(model.policy.q_table, before)
+
+
 def test_saving_is_an_observer(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     saving = make_model().learn(100)
     saving.save(tmp_path / "seen")
