@@ -50,11 +50,12 @@ class Audience:
     """
 
     def __init__(self, callback: BaseCallback) -> None:
-        leaves = list(_leaves(callback))
-        self._patient = [leaf for leaf in leaves if isinstance(leaf, PatientCallback)]
-        self._recorders = [record for leaf in self._patient if (record := leaf.recorder()) is not None]
+        #: all of them, without the lists that they are in
+        self.members = list(_leaves(callback))
+        self._patient = [member for member in self.members if isinstance(member, PatientCallback)]
+        self._recorders = [record for member in self._patient if (record := member.recorder()) is not None]
         #: those who are told of every step
-        self.listeners = [leaf for leaf in leaves if not isinstance(leaf, PatientCallback)]
+        self.listeners = [member for member in self.members if not isinstance(member, PatientCallback)]
         self._any_listens = bool(self.listeners)
         self._n_untold = 0
         self._patience = self._wait()

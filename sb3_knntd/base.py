@@ -398,7 +398,8 @@ class KNNAlgorithm(BaseAlgorithm):
             self._widen()
 
         # What is seen is handed on and not copied: SB3's algorithms hold on to what a VecEnv returned as well.
-        if audience.hears(new_obs, any_ended) and not audience.tell(locals(), self.num_timesteps):  # type: ignore[arg-type]
+        told = audience.members and audience.hears(new_obs, any_ended)  # type: ignore[arg-type]
+        if told and not audience.tell(locals(), self.num_timesteps):
             return False
         if n_logs:
             self.dump_logs()
