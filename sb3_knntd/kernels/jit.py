@@ -18,31 +18,28 @@ except Exception as error:  # a numba that does not fit the installed NumPy rais
     REASON = f"{type(error).__name__}: {error}"
 
 
-def jit(function: Function) -> Function:
+def jit(function: Function, forceinline: bool = False) -> Function:
     """
     Compile on the first call, keep the result on disk, and let other threads run meanwhile.
 
     :param function: to be compiled
+    :param forceinline: whether compiled functions have it in place of their calls
     :return: the compiled function, or ``function`` itself without numba
     """
-    return _compile(function)
-
-
-def inlined(function: Function) -> Function:
-    """
-    As :func:`jit`, and put in place of every call by compiled functions. For what is called for each neighbour: handing
-    over a dozen arrays takes longer than a glance into them.
-
-    :param function: to be compiled
-    :return: the compiled function, or ``function`` itself without numba
-    """
-    return _compile(function, forceinline=True)
-
-
-def _compile(function: Function, forceinline: bool = False) -> Function:
     if not AVAILABLE:
         return function
     try:
         return cast(Function, numba.njit(cache=True, nogil=True, forceinline=forceinline)(function))
     except RuntimeError:  # there is no folder that numba may write to
         return cast(Function, numba.njit(nogil=True, forceinline=forceinline)(function))
+
+
+def inlined(function: Function) -> Function:
+    """
+    As :func:`jit`, in place of every call by compiled functions. For what is called for each neighbour: handing over a
+    dozen arrays takes longer than a glance into them.
+
+    :param function: to be compiled
+    :return: the compiled function, or ``function`` itself without numba
+    """
+    return jit(function, forceinline=True)
