@@ -385,12 +385,16 @@ def _group_view(
     }
 
 
+def _greedy_episodes(comparison: Comparison) -> str:
+    return f"{comparison.eval_episodes} greedy episode" + "s" * (comparison.eval_episodes > 1)
+
+
 def _summary(comparison: Comparison, algos: Sequence[str]) -> str:
     seeds = comparison.seeds
     which = f"seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else f"seed {seeds[0]}"
     return (
         f"{', '.join(label(algo) for algo in algos)}: {comparison.steps:,} environment steps each, {which}, "
-        f"{comparison.eval_points} evaluations of {comparison.eval_episodes} greedy episodes along the way. "
+        f"{comparison.eval_points} evaluations of {_greedy_episodes(comparison)} along the way. "
         "This command computes it again:"
     )
 
@@ -443,7 +447,7 @@ def _method(comparison: Comparison) -> list[str]:
     return [
         f"Each run has {comparison.steps:,} environment steps, over all environments of its configuration together, "
         f"and is evaluated {comparison.eval_points} times at equal distances, the last time at the end: "
-        f"{comparison.eval_episodes} greedy episodes in environments of their own, whose starts are the same at every "
+        f"{_greedy_episodes(comparison)} in environments of their own, whose starts are the same at every "
         "point and, for a seed, for every algorithm. Observations are normalised as in training; returns are the "
         "environment's own.",
         "A run is a process of its own, on the CPU with one thread, and everything in it is seeded by its seed. Where "
