@@ -14,6 +14,7 @@ import signal
 import time
 import zipfile
 from collections.abc import Callable
+from multiprocessing.synchronize import Event
 from typing import Any
 
 import gymnasium as gym
@@ -34,7 +35,14 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import (
+    CloudpickleWrapper,
+    DummyVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecNormalize,
+)
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy_envs import DriftEnv, GridEnv, RecordingVecEnv
 
@@ -713,15 +721,25 @@ def test_where_there_is_no_checkpoint(make_model: MakeModel, tmp_path: pathlib.P
         TableCheckpointCallback.resume(tmp_path, DriftEnv())
 
 
-def in_child(work: Callable[[], Any], seconds: float | None = None) -> int | None:
-    """Run in a process that is killed after so many seconds, if it does not kill itself; its exit code."""
-    child = multiprocessing.get_context("fork").Process(target=work)
+def in_child(work: Callable[[Event], Any], seconds: float | None = None) -> int | None:
+    """
+    Run in a process of its own, which is killed so many seconds after it has set the event, if it does not kill itself;
+    its exit code. It is no fork of this one, whose libraries have threads.
+    """
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    child = context.Process(target=carry_out, args=(CloudpickleWrapper(work), begun))
     child.start()
-    child.join(seconds)
     if seconds is not None:
-        os.kill(child.pid, signal.SIGKILL)  # type: ignore[arg-type]
-        child.join()
+        assert begun.wait(60)
+        child.join(seconds)
+        child.kill()
+    child.join()
     return child.exitcode
+
+
+def carry_out(work: CloudpickleWrapper, begun: Event) -> None:
+    work.var(begun)
 
 
 DEADLY = {
@@ -741,7 +759,7 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(
     make_model().learn(40, callback=TableCheckpointCallback(tmp_path, n_last=2))
     owner, name = DEADLY[where]
 
-    def work() -> None:
+    def work(begun: Event) -> None:
         original, calls = getattr(owner, name), []
 
         def deadly(*args: Any, **kwargs: Any) -> Any:
@@ -777,13 +795,15 @@ class Rising(BaseCallback):
 def test_kills_at_random_moments(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     make_model().learn(20, callback=TableCheckpointCallback(tmp_path))
 
-    def work() -> None:
+    def work(begun: Event) -> None:
         model = TableCheckpointCallback.resume(tmp_path, DriftEnv())
+        model.learn(1, reset_num_timesteps=False)
+        begun.set()
         model.learn(10**9, callback=TableCheckpointCallback(tmp_path, save_freq=1), reset_num_timesteps=False)
 
     generator, reached = np.random.default_rng(0), 20
     for _ in range(6):
-        assert in_child(work, seconds=0.3 + generator.uniform(0.0, 0.3)) == -signal.SIGKILL
+        assert in_child(work, seconds=0.1 + generator.uniform(0.0, 0.3)) == -signal.SIGKILL
         steps = TableCheckpointCallback.resume(tmp_path, DriftEnv()).num_timesteps
         assert steps >= reached
         reached = steps
