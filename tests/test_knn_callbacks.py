@@ -731,7 +731,8 @@ def in_child(work: Callable[[Event], Any], seconds: float | None = None) -> int 
     child = context.Process(target=carry_out, args=(CloudpickleWrapper(work), begun))
     child.start()
     if seconds is not None:
-        assert begun.wait(60)
+        # Killed even if it never begins: nothing outlives a failed test.
+        begun.wait(60)
         child.join(seconds)
         child.kill()
     child.join()
