@@ -25,8 +25,10 @@ def loopback_cluster(**node: Any) -> Iterator[Cluster]:
     :param node: what the node has, as Ray calls it
     """
     folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # sockets have short names
-    head = {**NODE, "num_cpus": 0, "include_dashboard": False, "temp_dir": folder}
+    head = {**NODE, "num_cpus": 0, "include_dashboard": False}
     with pytest.MonkeyPatch.context() as patch:
+        # All that Ray writes goes there: the cluster's address too, which it writes whatever the head's own folder is.
+        patch.setenv("RAY_TMPDIR", folder)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         # Where clusters are not meant for several machines, Ray keeps to the loopback address.
         patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
