@@ -2,13 +2,14 @@
 Short runs whose tables are kept in ``tests/data/recorded_tables.npz``. A change of structure must not change
 a bit of them.
 
+Models and a filter that were saved then must still load.
+
 ``python tests/recorded_runs.py`` records them anew. Do that only where results are meant to change, and say so in the
 CHANGELOG.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,13 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from toy_envs import EpisodeEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, VecDeltaFilter
+from sb3_knntd.compare.sarsa import TileSarsa
 
-RECORDED = Path(__file__).parent / "data" / "recorded_tables.npz"
+DATA = Path(__file__).parent / "data"
+RECORDED = DATA / "recorded_tables.npz"
+#: What :func:`continued` gives for the files of ``SAVED`` and :func:`filtered` for the filter's.
+CONTINUED = DATA / "continued_tables.npz"
 
 
 class RationalEnv(EpisodeEnv):
@@ -65,7 +70,7 @@ class RationalEnv(EpisodeEnv):
         return np.array([self.x, self.v], dtype=np.float32)
 
 
-def _venv(n_envs: int = 1, **arguments: Any) -> VecEnv:
+def make_venv(n_envs: int = 1, **arguments: Any) -> VecEnv:
     return DummyVecEnv([partial(RationalEnv, offset=0.23 * index, **arguments) for index in range(n_envs)])
 
 
@@ -98,26 +103,74 @@ RUNS: dict[str, tuple[type[KNNTD | ExA], dict[str, Any], dict[str, Any]]] = {
 INEXACT = {"knntd_softmax", "knntd_gaussian"}
 
 
-def table_of(name: str) -> np.ndarray:
+#: The runs of which a model is kept as a file, written by the first version of the format.
+SAVED = ("knntd_4_envs", "knntd_hashed", "exa")
+LENGTHS: dict[str, Any] = {"lengths": (9, 57, 31), "ends": ("terminated", "truncated")}
+FILTER = DATA / "saved_filter.zip"
+
+
+def saved_file(name: str) -> Path:
     """
-    :param name: of the run, in ``RUNS``
-    :return: the table after it, shape (n_rows, n_actions)
+    :param name: of a run in ``SAVED``
+    :return: the file that its model was saved to after 500 steps
+    """
+    return DATA / f"saved_{name}.zip"
+
+
+def make_model(name: str) -> KNNTD | ExA:
+    """
+    :param name: of a run in ``RUNS``
+    :return: its model, which has not learned
     """
     algorithm, environment, arguments = RUNS[name]
-    lengths = {"lengths": (9, 57, 31), "ends": ("terminated", "truncated")}
-    model = algorithm(_venv(**lengths, **environment), **{"points": 9, "seed": 3, **arguments})
-    table: np.ndarray = model.learn(1600).policy.q_table.numpy()
+    return algorithm(make_venv(**LENGTHS, **environment), **{"points": 9, "seed": 3, **arguments})
+
+
+def table_of(name: str) -> np.ndarray:
+    """
+    :param name: of a run in ``RUNS``
+    :return: the table after it, shape (n_rows, n_actions)
+    """
+    table: np.ndarray = make_model(name).learn(1600).policy.q_table.numpy()
     return table
 
 
-def tables() -> Iterator[tuple[str, np.ndarray]]:
+def tile_weights() -> np.ndarray:
     """
-    :return: name and table of every run
+    :return: the weights that SARSA(λ) with tile coding ends with, shape (n_actions, n_features)
     """
-    for name in RUNS:
-        yield name, table_of(name)
+    model = TileSarsa("TilePolicy", make_venv(**LENGTHS), n_tiles=5, n_tilings=4, seed=3)
+    weights: np.ndarray = model.learn(1600).policy.weights.numpy()
+    return weights
+
+
+def continued(name: str) -> np.ndarray:
+    """
+    :param name: of a run in ``SAVED``
+    :return: the table of the model in its file after 300 further steps, shape (n_rows, n_actions)
+    """
+    algorithm, environment, _ = RUNS[name]
+    model = algorithm.load(saved_file(name), env=make_venv(**LENGTHS, **environment))
+    table: np.ndarray = model.learn(300, reset_num_timesteps=False).policy.q_table.numpy()
+    return table
+
+
+def filtered(venv: VecDeltaFilter) -> np.ndarray:
+    """
+    :param venv: a filter over one :class:`RationalEnv`
+    :return: what it makes of the observations of 100 steps, shape (100, 2)
+    """
+    venv.reset()
+    return np.array([venv.step(np.array([step % 3]))[0][0] for step in range(100)])
 
 
 if __name__ == "__main__":
-    RECORDED.parent.mkdir(exist_ok=True)
-    np.savez_compressed(RECORDED, **dict(tables()))
+    DATA.mkdir(exist_ok=True)
+    np.savez_compressed(RECORDED, tile_sarsa=tile_weights(), **{name: table_of(name) for name in RUNS})
+    for name in SAVED:
+        make_model(name).learn(500).save(saved_file(name))
+    venv = VecDeltaFilter(make_venv(**LENGTHS))
+    filtered(venv)
+    venv.save(FILTER)
+    loaded = VecDeltaFilter.load(FILTER, make_venv(**LENGTHS))
+    np.savez_compressed(CONTINUED, filter=filtered(loaded), **{name: continued(name) for name in SAVED})
