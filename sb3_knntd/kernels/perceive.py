@@ -1,16 +1,55 @@
-"""From an observation to its neighbours' probabilities."""
+"""From an observation to the probabilities of its neighbours."""
 
 from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_knntd.kernels.jit import jit
 from sb3_knntd.kernels.nearest import nearest_of_all, nearest_on_lattice
 
-#: How neighbours are found: in the kernel on a lattice, in the kernel among all points, or before it is called.
-LATTICE, ALL, FOUND = 0, 1, 2
-#: How they are weighed.
-INVERSE_QUADRATIC, GAUSSIAN = 0, 1
+
+class SearchKind(IntEnum):
+    """How neighbours are found: on a lattice, among all points, or before the kernel is called."""
+
+    LATTICE = 0
+    ALL_POINTS = 1
+    OUTSIDE = 2
+
+
+class Weighting(IntEnum):
+    """How neighbours are weighted by distance. The names in lower case are the words that users pass."""
+
+    INVERSE_QUADRATIC = 0
+    GAUSSIAN = 1
+
+
+class PerceptionArguments(NamedTuple):
+    """
+    What :func:`perceive` needs besides the observation.
+
+    :param low: lower bounds, observation units, shape (obs_dim,)
+    :param width: upper minus lower bounds, observation units, shape (obs_dim,)
+    :param limit: largest size of scaled values
+    :param search: a :class:`SearchKind`
+    :param axes: of the lattice, see :func:`~sb3_knntd.kernels.nearest.nearest_on_lattice`
+    :param offsets: of the lattice, likewise
+    :param columns: coordinates of the points, see :func:`~sb3_knntd.kernels.nearest.nearest_of_all`
+    :param weighting: a :class:`Weighting`
+    :param bandwidth: h, scaled units
+    """
+
+    low: np.ndarray
+    width: np.ndarray
+    limit: float
+    search: int
+    axes: np.ndarray
+    offsets: np.ndarray
+    columns: np.ndarray
+    weighting: int
+    bandwidth: float
 
 
 @jit
@@ -24,42 +63,42 @@ def are_within(observations, low, high):
 
 
 @jit
-def perceive(
-    observation, low, width, limit, search, axes, offsets, columns, weights, bandwidth, indices, probabilities
-):
+def weigh(weighting, bandwidth, squared_distances):
+    """Replace squared distances, rising, shape (k,), by weights that sum to 1 (eqs. 5 and 6)."""
+    nearest, total = squared_distances[0], 0.0
+    for i in range(len(squared_distances)):
+        if weighting == Weighting.INVERSE_QUADRATIC:
+            weight = 1.0 / (1.0 + squared_distances[i] / (bandwidth * bandwidth))
+        elif weighting == Weighting.GAUSSIAN:
+            weight = np.exp(-(squared_distances[i] - nearest) / (2.0 * (bandwidth * bandwidth)))
+        else:
+            raise ValueError("the kernels do not know this weighting")
+        squared_distances[i] = weight
+        total += weight
+    for i in range(len(squared_distances)):
+        squared_distances[i] /= total
+
+
+@jit
+def perceive(observation, arguments, indices, probabilities):
     """
-    Bounds, search and weights of one observation. All but the first and the last two arguments are ``eyes``, in
-    this order, wherever that is spoken of.
+    Bounds, search and weights of one observation.
 
     :param observation: observation units, shape (obs_dim,)
-    :param low: lower bounds, observation units, shape (obs_dim,)
-    :param width: upper less lower bounds, likewise
-    :param limit: how far scaled values reach
-    :param search: ``LATTICE``, ``ALL`` or ``FOUND``
-    :param axes: of the lattice, see :func:`~sb3_knntd.kernels.nearest.nearest_on_lattice`
-    :param offsets: likewise
-    :param columns: of the points, see :func:`~sb3_knntd.kernels.nearest.nearest_of_all`
-    :param weights: ``INVERSE_QUADRATIC`` or ``GAUSSIAN``
-    :param bandwidth: h, scaled units
-    :param indices: to be filled, or with search ``FOUND`` given, shape (k,), int64
-    :param probabilities: to be filled, shape (k,); with search ``FOUND`` the squared distances are given in it
+    :param arguments: see :class:`PerceptionArguments`
+    :param indices: to be filled, or with search ``OUTSIDE`` given, shape (k,), int64
+    :param probabilities: to be filled, shape (k,); with search ``OUTSIDE`` the squared distances are given in it
     """
     k = len(indices)
-    if search != FOUND:
+    if arguments.search != SearchKind.OUTSIDE:
         scaled = np.empty(len(observation))
+        low, width, limit = arguments.low, arguments.width, arguments.limit
         for j in range(len(observation)):
             scaled[j] = min(max(2.0 * ((observation[j] - low[j]) / width[j]) - 1.0, -limit), limit)
-        if search == LATTICE:
-            nearest_on_lattice(scaled, axes, offsets, k, indices, probabilities)
+        if arguments.search == SearchKind.LATTICE:
+            nearest_on_lattice(scaled, arguments.axes, arguments.offsets, k, indices, probabilities)
+        elif arguments.search == SearchKind.ALL_POINTS:
+            nearest_of_all(scaled, arguments.columns, k, indices, probabilities)
         else:
-            nearest_of_all(scaled, columns, k, indices, probabilities)
-    nearest = probabilities[0]
-    together = 0.0
-    for i in range(k):
-        if weights == INVERSE_QUADRATIC:
-            probabilities[i] = 1.0 / (1.0 + probabilities[i] / (bandwidth * bandwidth))
-        else:
-            probabilities[i] = np.exp(-(probabilities[i] - nearest) / (2.0 * (bandwidth * bandwidth)))
-        together += probabilities[i]
-    for i in range(k):
-        probabilities[i] /= together
+            raise ValueError("the kernels do not know this search")
+    weigh(arguments.weighting, arguments.bandwidth, probabilities)
