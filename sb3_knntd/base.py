@@ -118,6 +118,9 @@ class KNNAlgorithm(BaseAlgorithm):
         #: ε or the temperature at the last step
         self.exploration_rate = 0.0
         self._last_actions: np.ndarray | None = None
+        # What the last step led to, and while callbacks are told of a step what was acted on in it.
+        self._standing: np.ndarray | None = None
+        self._acted_on: np.ndarray | None = None
         self._n_measured = 0
         self._measuring = False
 
@@ -343,6 +346,7 @@ class KNNAlgorithm(BaseAlgorithm):
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        self._standing = self._last_obs  # type: ignore[assignment]
         if total_timesteps > self.num_timesteps:
             self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
         return total_timesteps, callback
@@ -359,6 +363,12 @@ class KNNAlgorithm(BaseAlgorithm):
         assert env is not None
         for listener in audience.listeners:
             listener.on_rollout_start()
+        last_obs = self._last_obs
+        if last_obs is not self._standing:
+            # A callback has moved the environments, or has given others, which need a reset if it did not say where.
+            self._last_actions = None
+            if last_obs is None:
+                self._last_obs = last_obs = env.reset()  # type: ignore[assignment]
         actions = self._last_actions
         if actions is None or self._measuring:
             actions = self._random_actions() if self._measuring else self._first_actions()
@@ -386,26 +396,46 @@ class KNNAlgorithm(BaseAlgorithm):
             # What was going on in the environments is lost with this step: to go on is to begin anew.
             self._last_obs = self._last_actions = None
             raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
-        self._last_obs = new_obs  # type: ignore[assignment]
+        self._standing = new_obs  # type: ignore[assignment]
         n_logs = 0
-        if any_ended:
+        reported = any_ended
+        for info in infos:
+            if "episode" in info:
+                reported = True
+        if reported:
             self._update_info_buffer(infos, dones)
+        if any_ended:
             before = self._episode_num
             self._episode_num += ended.count(True)
             n_logs = self._episode_num // log_interval - before // log_interval if log_interval else 0
 
-        if self._adapts and not (self._measuring or self.policy.perceiver.sees(self._last_obs)):  # type: ignore[arg-type]
-            self._widen()
+        if self._adapts and not (self._measuring or self.policy.perceiver.sees(new_obs)):  # type: ignore[arg-type]
+            self._widen(new_obs)  # type: ignore[arg-type]
 
         # What is seen is handed on and not copied: SB3's algorithms hold on to what a VecEnv returned as well.
-        told = audience.members and audience.hears(new_obs, any_ended)  # type: ignore[arg-type]
-        if told and not audience.tell(locals(), self.num_timesteps):
-            return False
+        if audience.members and audience.hears(new_obs, any_ended):  # type: ignore[arg-type]
+            self._acted_on = last_obs  # type: ignore[assignment]
+            try:
+                go_on = audience.tell(locals(), self.num_timesteps)
+            finally:
+                self._move_on()
+                self._acted_on = None
+            if not go_on:
+                return False
+        else:
+            self._last_obs = new_obs  # type: ignore[assignment]
         if n_logs:
             self.dump_logs()
         for listener in audience.listeners:
             listener.on_rollout_end()
         return True
+
+    def _move_on(self) -> None:
+        """Be where the step led, or where a callback that was told of it says: episodes begin there."""
+        if self._last_obs is self._acted_on:
+            self._last_obs = self._standing
+        else:
+            self._last_actions = None
 
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
@@ -456,9 +486,9 @@ class KNNAlgorithm(BaseAlgorithm):
         if not self._measuring:
             self._tell_range(f"measured over {self._n_measured} random steps")
 
-    def _widen(self) -> None:
+    def _widen(self, observations: np.ndarray) -> None:
         """Take in the last observations, and begin anew from there."""
-        self.policy.widen(th.from_numpy(self._last_obs).to(self.device))
+        self.policy.widen(th.from_numpy(observations).to(self.device))
         self._last_actions = None
         self._tell_range(f"widened at step {self.num_timesteps}")
 
@@ -498,7 +528,8 @@ class KNNAlgorithm(BaseAlgorithm):
     # ------------------------------------------------------ saving and loading
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rule", "_stream", "_prediction_stream"]
+        ours = ["_rule", "_stream", "_prediction_stream", "_standing", "_acted_on"]
+        return [*super()._excluded_save_params(), *ours]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "learner"], []
@@ -518,15 +549,22 @@ class KNNAlgorithm(BaseAlgorithm):
         :param include: attributes to save although SB3 leaves them out
         """
         self._stream_states = [self._stream.state(), self._prediction_stream.state()]
-        if not isinstance(path, (str, pathlib.Path)):
-            super().save(path, exclude, include)
-            return
-        target = pathlib.Path(path)
-        if not target.suffix:
-            target = target.with_name(f"{target.name}.zip")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as file:
-            super().save(file, exclude, include)
+        shown = self._last_obs, self._last_actions
+        if self._acted_on is not None:
+            # A callback saves: its file goes on where the next step does.
+            self._move_on()
+        try:
+            if not isinstance(path, (str, pathlib.Path)):
+                super().save(path, exclude, include)
+                return
+            target = pathlib.Path(path)
+            if not target.suffix:
+                target = target.with_name(f"{target.name}.zip")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(target) as file:
+                super().save(file, exclude, include)
+        finally:
+            self._last_obs, self._last_actions = shown
 
     @classmethod
     def load(
