@@ -327,6 +327,7 @@ class KNNAlgorithm(BaseAlgorithm):
             if not self._step(audience, log_interval):
                 break
         audience.catch_up(self.num_timesteps)
+        self.policy.set_training_mode(False)
         callback.on_training_end()
         return self
 

@@ -24,6 +24,7 @@ from sb3_knntd.perception.points import count_neighbors
 from sb3_knntd.perception.search import SEARCHES, make_search
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.rules import mean_actions, mean_rows
+from sb3_knntd.tracing import is_traced
 
 #: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
 DENSE_TABLE_BYTES = 2**28
@@ -267,7 +268,7 @@ class KNNPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         assert isinstance(self.action_space, spaces.Discrete)
-        return greedy(mean_rows(*self._rows(observation))) + int(self.action_space.start)
+        return greedy(mean_rows(*self._exact_rows(observation))) + int(self.action_space.start)
 
     def _to_tensor(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         array = observation.cpu().numpy() if isinstance(observation, th.Tensor) else np.asarray(observation)
@@ -276,7 +277,8 @@ class KNNPolicy(BasePolicy):
         return tensor
 
     def _perceive(self, observations: th.Tensor) -> Perception:
-        if not th.isfinite(observations).all():
+        # While torch records, there are no values to look at.
+        if not is_traced() and not th.isfinite(observations).all():
             raise ValueError(f"observation must be finite; got {observations.tolist()}")
         perception: Perception = self.perceiver(observations)
         return perception
@@ -284,6 +286,11 @@ class KNNPolicy(BasePolicy):
     def _rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         perception = self._perceive(observations)
         return self.table.rows(perception.indices), perception.probabilities.to(self.table.values.dtype)
+
+    def _exact_rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The same in the arithmetic of the compiled search for the best entries, whatever type the table has."""
+        perception = self._perceive(observations)
+        return self.table.rows(perception.indices).double(), perception.probabilities
 
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> KNNPolicy:
         super()._apply(fn, recurse)
@@ -338,6 +345,8 @@ class ExAPolicy(KNNPolicy):
         self._action_shape = None if len(action_space.shape) == 1 else (-1, *action_space.shape)
         # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
         self._can_exceed = action_space.dtype != np.float32
+        self._column_points = th.from_numpy(columns.points)
+        self._action_bounds = [th.from_numpy(bound) for bound in (action_space.low, action_space.high)]
 
     @property
     def action_points(self) -> list[th.Tensor]:
@@ -365,9 +374,14 @@ class ExAPolicy(KNNPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
-        rows, probabilities = self._rows(observation)
+        rows, probabilities = self._exact_rows(observation)
         blocks = self.columns.blocks.tolist()
         entries = [first + greedy(rows[..., first:end]) for first, end in pairwise(blocks)]
-        points = th.from_numpy(self.columns.points).to(probabilities)
+        points = self._column_points.to(probabilities)
         actions = mean_actions(th.stack(entries, dim=2), probabilities, points)
-        return th.from_numpy(self.fit_actions(actions.cpu().numpy()))
+        # As fit_actions, in torch operations, so that it can be traced.
+        if self._actions_are_whole:
+            actions = actions.round()
+        low, high = (bound.to(points.device) for bound in self._action_bounds)
+        fitting = actions.to(low.dtype).reshape(-1, *low.shape)
+        return th.minimum(th.maximum(fitting, low), high) if self._can_exceed else fitting

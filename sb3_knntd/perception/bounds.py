@@ -56,6 +56,8 @@ class Bounds(nn.Module):
         super().__init__()
         self.adaptive = adaptive
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        #: number of observation dimensions
+        self.obs_dim = len(low)
         sensible = (np.abs(low) <= LARGEST_SENSIBLE_BOUND) & (np.abs(high) <= LARGEST_SENSIBLE_BOUND) & (low < high)
         is_open = ~sensible | adaptive
         self.register_buffer("low", th.from_numpy(np.where(is_open, -1.0, low)))
@@ -65,11 +67,6 @@ class Bounds(nn.Module):
         self.register_buffer("highest", th.from_numpy(np.where(sensible, high, np.inf)), persistent=False)
         self.register_buffer("seen_low", th.full_like(self.low, th.inf))
         self.register_buffer("seen_high", th.full_like(self.low, -th.inf))
-
-    @property
-    def obs_dim(self) -> int:
-        """Number of observation dimensions."""
-        return len(self.low)
 
     @property
     def is_open(self) -> bool:

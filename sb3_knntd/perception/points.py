@@ -55,14 +55,15 @@ class Lattice(Points):
                 "Give fewer points a dimension, 1 for dimensions that matter little"
             )
         self.axes = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in self.shape]
+        self._axes = [th.from_numpy(axis) for axis in self.axes]
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
         device = bounds.low.device
         rest = th.arange(self.n_points, device=device) if indices is None else indices
         columns = []
-        for axis in reversed(self.axes):
-            columns.append(th.from_numpy(axis).to(device)[rest % len(axis)])
-            rest = rest // len(axis)
+        for axis, count in zip(reversed(self._axes), reversed(self.shape), strict=True):
+            columns.append(axis.to(device)[rest % count])
+            rest = rest // count
         return th.stack(columns[::-1], dim=1)
 
 
@@ -74,11 +75,11 @@ class Scattered(Points):
     """
 
     def __init__(self, places: np.ndarray) -> None:
-        self.places = np.array(places, dtype=np.float64)
+        self.places = th.from_numpy(np.array(places, dtype=np.float64))
         self.n_points, self.obs_dim = self.places.shape
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
-        places = th.from_numpy(self.places).to(bounds.low.device)
+        places = self.places.to(bounds.low.device)
         return bounds.scale(places if indices is None else places[indices])
 
 
