@@ -12,6 +12,7 @@ from math import isfinite
 from statistics import fmean
 from typing import Any, ClassVar, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -20,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.audience import Audience
 from sb3_knntd.checks import check_number, check_schedule, check_word
@@ -53,6 +55,8 @@ class KNNAlgorithm(BaseAlgorithm):
     exploration_final_eps: float
     exploration_fraction: float
 
+    #: What a saved file calls the algorithm: subclasses read each other's.
+    _algorithm: ClassVar[str]
     #: What an action space must be, and what to do with another.
     _supported_action_space: ClassVar[type[spaces.Space[Any]]]
     _action_space_advice: ClassVar[str]
@@ -100,7 +104,7 @@ class KNNAlgorithm(BaseAlgorithm):
             seed=seed,
         )
         #: Which algorithm a saved file is of.
-        self.algorithm = type(self).__name__
+        self.algorithm = self._algorithm
         self.gamma = gamma
         self.trace_decay = trace_decay
         self.n_neighbors = n_neighbors
@@ -143,25 +147,43 @@ class KNNAlgorithm(BaseAlgorithm):
         cls, policy: str | type[BasePolicy] | GymEnv, env: GymEnv | str | None
     ) -> tuple[type[KNNPolicy], GymEnv | str | None]:
         """Tell policy and environment apart: either order of giving them works."""
-        call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{next(iter(cls.policy_aliases))}", env)'
+        name = next(iter(cls.policy_aliases))
+        default: type[KNNPolicy] = cls.policy_aliases[name]  # type: ignore[assignment]
+        call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{name}", env)'
+        for given in (policy, env):
+            if isinstance(given, type) and issubclass(given, (gym.Env, gym.vector.VectorEnv, VecEnv)):
+                raise ValueError(
+                    f"env must be an environment; got the class {given.__name__}. Make one of it: "
+                    f"{cls.__name__}({given.__name__}(...))"
+                )
+            if isinstance(given, gym.vector.VectorEnv):
+                raise ValueError(
+                    f"{cls.__name__} takes SB3's VecEnv, and environments of gymnasium.vector are none; got {given!r}. "
+                    "In place of gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
+                )
         if isinstance(policy, str) and policy in cls.policy_aliases:
             policy = cls.policy_aliases[policy]
         if isinstance(policy, str) and policy.endswith("Policy"):
             raise ValueError(
-                f"{cls.__name__} has no {policy!r}: it learns a table and has no network to choose. Call {call}"
+                f"{cls.__name__} has no {policy!r}: its one policy is named {name!r}, as it learns a table and has no "
+                f"network to choose. Call {call}"
             )
         if isinstance(policy, type):
-            if not issubclass(policy, KNNPolicy):
-                raise ValueError(f"policy must be a KNNPolicy; got {policy.__name__}. Call {call}")
+            if not (issubclass(policy, default) and policy.acts_in is cls._supported_action_space):
+                raise ValueError(
+                    f"policy of {cls.__name__} must be {default.__name__} or a subclass with actions in a "
+                    f"{cls._supported_action_space.__name__}; got {policy.__name__}. Call {call}"
+                )
             return policy, env
         if env is not None:
             raise ValueError(f"two environments were given, {policy!r} and {env!r}. Call {call}")
-        return next(iter(cls.policy_aliases.values())), policy  # type: ignore[return-value]
+        return default, policy
 
     @classmethod
     def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         discrete = isinstance(observation_space, spaces.Discrete) or (
-            isinstance(observation_space, spaces.MultiDiscrete) and observation_space.nvec.ndim == 1
+            isinstance(observation_space, spaces.MultiDiscrete | spaces.MultiBinary)
+            and len(observation_space.shape or ()) == 1
         )
         vector = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
         if not (discrete or (vector and observation_space.shape != (0,))):
@@ -175,8 +197,8 @@ class KNNAlgorithm(BaseAlgorithm):
             else:
                 advice = "Map it to a Box of shape (n,) with gymnasium.wrappers.TransformObservation"
             raise ValueError(
-                f"{cls.__name__} takes observations in a Box of shape (n,), Discrete or MultiDiscrete of one axis; "
-                f"got {observation_space}. {advice}"
+                f"{cls.__name__} takes observations in a Box of shape (n,), Discrete, or MultiDiscrete or MultiBinary "
+                f"of one axis; got {observation_space}. {advice}"
             )
         if not isinstance(action_space, cls._supported_action_space):
             raise ValueError(
@@ -347,6 +369,12 @@ class KNNAlgorithm(BaseAlgorithm):
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        if self.learner.table is not self.policy.table:
+            raise ValueError(
+                "model.policy has been replaced, and what is learned would go to the one that the model was made with. "
+                "Leave that one, and have it take over what the other has learned: "
+                "model.policy.load_state_dict(other.state_dict()), with the points, bounds and dtype of the other"
+            )
         self._standing = self._last_obs  # type: ignore[assignment]
         if total_timesteps > self.num_timesteps:
             self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
@@ -593,9 +621,9 @@ class KNNAlgorithm(BaseAlgorithm):
         :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has
         """
         saved = read_description(path)
-        if saved.get("algorithm") != cls.__name__:
+        if saved.get("algorithm") != cls._algorithm:
             raise ValueError(
-                f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls.__name__}: "
+                f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls._algorithm}: "
                 "load it with its own class"
             )
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)

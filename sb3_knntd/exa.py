@@ -59,6 +59,7 @@ class ExA(KNNAlgorithm):
 
     policy: ExAPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": ExAPolicy}
+    _algorithm: ClassVar[str] = "ExA"
     _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Box
     _action_space_advice: ClassVar[str] = "For Discrete actions use KNNTD"
 

@@ -27,8 +27,8 @@ class KNNTD(KNNAlgorithm):
 
     Paper: Martin H., de Lope, Maravall, "Robust high performance reinforcement learning through weighted k-nearest
     neighbors", Neurocomputing 74 (2011), https://doi.org/10.1016/j.neucom.2010.07.027. With ``trace_decay=0`` it is
-    kNN-TD (Algorithm 2), with ``n_neighbors=1`` besides NN-TD (Algorithm 1). On Discrete and MultiDiscrete
-    observations it is exact tabular SARSA(λ) or Q(λ).
+    kNN-TD (Algorithm 2), with ``n_neighbors=1`` besides NN-TD (Algorithm 1). On Discrete, MultiDiscrete
+    and MultiBinary observations it is exact tabular SARSA(λ) or Q(λ).
 
     .. code-block:: python
 
@@ -43,10 +43,10 @@ class KNNTD(KNNAlgorithm):
     :param gamma: γ, in [0, 1]
     :param trace_decay: λ, in [0, 1], or a function of the remaining progress
     :param n_neighbors: k >= 1; ``"auto"`` is 2 obs_dim + 1, a point and its neighbours along each axis, and 1 on
-        Discrete and MultiDiscrete observations
+        Discrete, MultiDiscrete and MultiBinary observations
     :param points: the perception points: an int or one int a dimension for a lattice over the bounds, or an array
         (n_points, obs_dim) in observation units for scattered points; ``"auto"`` is a lattice of about 8000 points,
-        at most 20 in a dimension, or one point a state on Discrete and MultiDiscrete observations
+        at most 20 in a dimension, or one point a state on Discrete, MultiDiscrete and MultiBinary ones
     :param bounds: the range mapped to [-1, 1]: (low, high), arrays (obs_dim,) in observation units; ``None`` takes the
         space's, and finds a range for every dimension that has none in a random phase at the start of :meth:`learn`;
         ``"adaptive"`` finds one for every dimension there, and widens it whenever an observation lies beyond, carrying
@@ -82,6 +82,7 @@ class KNNTD(KNNAlgorithm):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": KNNPolicy}
+    _algorithm: ClassVar[str] = "KNNTD"
     _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
     _action_space_advice: ClassVar[str] = (
         "For a Box of actions use ExA; MultiDiscrete and MultiBinary can be numbered into one Discrete space by "

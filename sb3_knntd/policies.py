@@ -7,6 +7,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, ClassVar
 
+import cloudpickle
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -34,11 +35,10 @@ class KNNPolicy(BasePolicy):
     """
     A table of action values at points of the observation space, read as a weighted mean over the k nearest.
 
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param action_space: Discrete
     :param lr_schedule: not used, there is nothing to optimise; part of SB3's signature
-    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for Discrete and
-        MultiDiscrete
+    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for all but a Box
     :param points: ``"auto"``, an int, one int a dimension, or an array (n_points, obs_dim) in observation units
     :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
@@ -56,6 +56,8 @@ class KNNPolicy(BasePolicy):
     :raises ValueError: if an argument does not fit; the message says which, and what would
     """
 
+    #: the action spaces that it is for
+    acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
     #: whether one action is chosen from the average of the neighbours' rows
     _AVERAGES: ClassVar[bool] = True
 
@@ -303,6 +305,40 @@ class KNNPolicy(BasePolicy):
         self.perceiver.fit()
         return answer
 
+    def save(self, path: str) -> None:
+        """
+        Save the policy, functions among its arguments as well.
+
+        :param path: file, or file-like object
+        """
+        content = {"state_dict": self.state_dict(), "data": self._get_constructor_parameters()}
+        th.save(content, path, pickle_module=cloudpickle)
+
+    def parameters_to_vector(self) -> np.ndarray:
+        """
+        :return: the entries of :attr:`q_table`, row by row, shape (n_points * n_actions,), the table's dtype
+        """
+        vector: np.ndarray = self.q_table.detach().cpu().numpy().flatten()
+        return vector
+
+    def load_from_vector(self, vector: np.ndarray) -> None:
+        """
+        Set the entries of :attr:`q_table`, also while episodes go on. A learner's traces are let go.
+
+        :param vector: what :meth:`parameters_to_vector` of a policy with the same points returned
+        :raises ValueError: if it has another length, or is not finite
+        """
+        state = self.state_dict()
+        values = th.as_tensor(vector, dtype=self.table.values.dtype)
+        if values.shape != (self.q_table.numel(),):
+            raise ValueError(
+                f"vector must have shape ({self.q_table.numel()},), a number for each entry of q_table; got "
+                f"{tuple(values.shape)}"
+            )
+        if not th.isfinite(values).all():
+            raise ValueError("vector must be finite; got NaN or infinity in it")
+        self.load_state_dict({**state, "table.values": values.reshape(self.q_table.shape)})
+
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
             "observation_space": self.observation_space,
@@ -315,7 +351,7 @@ class ExAPolicy(KNNPolicy):
     """
     A table of the values of action points, of which each neighbour recommends its best, and the mean is taken.
 
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param action_space: Box with finite bounds
     :param lr_schedule: not used
     :param action_points: see :class:`~sb3_knntd.ExA`
@@ -324,6 +360,7 @@ class ExAPolicy(KNNPolicy):
     :raises ValueError: if an argument does not fit; the message says which, and what would
     """
 
+    acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Box
     _AVERAGES: ClassVar[bool] = False
 
     def __init__(
