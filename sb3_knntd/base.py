@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_knntd.audience import Audience
 from sb3_knntd.checks import check_number, check_schedule, check_word
@@ -119,6 +119,8 @@ class KNNAlgorithm(BaseAlgorithm):
         self.tie_break = tie_break
         self.initial_value = initial_value
 
+        # Where the points lie depends on it.
+        self._normalized = normalizes_observations(self.env)
         #: ε or the temperature at the last step
         self.exploration_rate = 0.0
         self._last_actions: np.ndarray | None = None
@@ -215,7 +217,6 @@ class KNNAlgorithm(BaseAlgorithm):
         # What stays as it is need not be asked for: a call more is felt in steps this short.
         self._constant_rates = [None if callable(rate) else rate for rate in (self.learning_rate, self.trace_decay)]
         self.exploration_schedule = self._make_exploration_schedule()
-        normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
         unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
         if unknown:
             raise ValueError(
@@ -232,7 +233,7 @@ class KNNAlgorithm(BaseAlgorithm):
             bandwidth=self.bandwidth,
             search=self.search,
             initial_value=self.initial_value,
-            bounds_from_space=not normalizes,
+            bounds_from_space=not self._normalized,
             **self._policy_arguments(),
             **self.policy_kwargs,
         ).to(self.device)
@@ -272,6 +273,32 @@ class KNNAlgorithm(BaseAlgorithm):
         final = check_number("exploration_final_eps", self.exploration_final_eps, 0.0, 1.0)
         fraction = check_number("exploration_fraction", self.exploration_fraction, 0.0, 1.0, above=True)
         return LinearSchedule(initial, final, fraction)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Set the environment to learn from.
+
+        :param env: one of the same spaces, and as many if it is a VecEnv
+        :param force_reset: whether ``learn`` starts new episodes
+        :raises ValueError: if its observations are normalised (VecNormalize) and those that the model was made for are
+            not, or the other way round; as in SB3, if its spaces differ
+        """
+        self._check_normalization(env)
+        super().set_env(env, force_reset)
+
+    def _check_normalization(self, env: GymEnv | None) -> None:
+        normalized = normalizes_observations(env)
+        if normalized and not self._normalized:
+            raise ValueError(
+                "env normalises observations (VecNormalize), and the points of this model were laid for observations "
+                f"as they are. Make a model with it, {type(self).__name__}(VecNormalize(env)), or leave observations "
+                "as they are, VecNormalize(env, norm_obs=False)"
+            )
+        if self._normalized and not normalized:
+            raise ValueError(
+                "the points of this model were laid for normalised observations (VecNormalize), and env does not "
+                "normalise them. Wrap it with what was known of them: VecNormalize.load(path, env)"
+            )
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -627,6 +654,8 @@ class KNNAlgorithm(BaseAlgorithm):
                 "load it with its own class"
             )
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if env is not None:
+            model._check_normalization(model.env)
         if model.n_envs != saved["n_envs"]:
             model._last_obs = None
         if not model.learner.in_episodes:
@@ -636,6 +665,15 @@ class KNNAlgorithm(BaseAlgorithm):
             for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
                 stream.set_state(state)
         return model
+
+
+def normalizes_observations(env: GymEnv | None) -> bool:
+    """
+    :param env: an environment, VecEnv or not
+    :return: whether it is in a VecNormalize that changes observations
+    """
+    normalizer = unwrap_vec_normalize(env)  # type: ignore[arg-type]
+    return normalizer is not None and normalizer.norm_obs
 
 
 def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:

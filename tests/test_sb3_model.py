@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from toy_envs import DriftEnv, PushEnv
 
 from sb3_knntd import KNNTD, ExA
@@ -242,3 +242,50 @@ def test_another_policy_is_refused_with_what_to_do(
     assert th.equal(model.policy.q_table, teacher.policy.q_table)
     model.learn(100)
     assert not th.equal(model.policy.q_table, teacher.policy.q_table)
+
+
+# ------------------------------------------------------------- normalised observations
+
+
+def test_an_environment_that_normalises_is_set_where_the_model_was_made_for_it(
+    make_model: MakeModel, make_venv: MakeVenv, algorithm: Algorithm, tmp_path: pathlib.Path
+) -> None:
+    model = make_model(make_venv()).learn(50)
+    before = model.get_env()
+    message = message_of(lambda: model.set_env(VecNormalize(make_venv())))
+    assert f"{algorithm.__name__}(VecNormalize(env))" in message
+    assert "norm_obs=False" in message
+    assert model.get_env() is before
+    model.learn(50, reset_num_timesteps=False)
+    # What the message says works.
+    model.set_env(VecNormalize(make_venv(), norm_obs=False))
+    assert model.get_vec_normalize_env() is model.get_env()
+    model.learn(50)
+    model.save(tmp_path / "model")
+    assert "VecNormalize" in message_of(lambda: algorithm.load(tmp_path / "model", env=VecNormalize(make_venv())))
+    algorithm.load(tmp_path / "model", env=make_venv()).learn(10)
+
+
+def test_a_model_of_normalised_observations_goes_on_with_them_alone(
+    make_model: MakeModel, make_venv: MakeVenv, algorithm: Algorithm, tmp_path: pathlib.Path
+) -> None:
+    venv = VecNormalize(make_venv())
+    model = make_model(venv, bounds=None).learn(1_200)
+    model.save(tmp_path / "model")
+    venv.save(str(tmp_path / "normalize"))
+    loaded = algorithm.load(tmp_path / "model")
+    for call in (
+        lambda: model.set_env(make_venv()),
+        lambda: loaded.set_env(VecNormalize(make_venv(), norm_obs=False)),
+        lambda: algorithm.load(tmp_path / "model", env=make_venv()),
+    ):
+        assert "VecNormalize.load(path, env)" in message_of(call)
+    again = VecNormalize.load(str(tmp_path / "normalize"), make_venv())
+    loaded.set_env(again)
+    assert loaded.get_vec_normalize_env() is again
+    loaded.learn(50)
+    assert algorithm.load(tmp_path / "model", env=again).learn(50).num_timesteps == 50
+    # A policy that is saved by itself stands where the model's does.
+    loaded.policy.save(tmp_path / "policy")  # type: ignore[arg-type]
+    policy = type(loaded.policy).load(tmp_path / "policy")  # type: ignore[arg-type]
+    assert th.equal(policy.points, model.policy.points)
