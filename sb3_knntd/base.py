@@ -20,11 +20,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_knntd.audience import Audience
-from sb3_knntd.checks import check_number, check_schedule, check_word
+from sb3_knntd.checks import check_number, check_word
 from sb3_knntd.compiled_learner import CompiledLearner
 from sb3_knntd.files import read_description, replacing
 from sb3_knntd.kernels.step import UNDRAWN
@@ -34,6 +34,7 @@ from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule
+from sb3_knntd.schedules import check_rate, make_schedule
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
@@ -66,9 +67,9 @@ class KNNAlgorithm(BaseAlgorithm):
         policy: str | type[BasePolicy] | GymEnv,
         env: GymEnv | str | None,
         *,
-        learning_rate: float | Schedule,
+        learning_rate: float | Schedule | str,
         gamma: float,
-        trace_decay: float | Schedule,
+        trace_decay: float | Schedule | str,
         n_neighbors: int | str,
         points: Any,
         bounds: Any,
@@ -94,7 +95,7 @@ class KNNAlgorithm(BaseAlgorithm):
         super().__init__(
             policy_class,
             env,
-            learning_rate,
+            learning_rate,  # type: ignore[arg-type]
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -213,9 +214,10 @@ class KNNAlgorithm(BaseAlgorithm):
             raise ValueError(f"env must be given to build a model: {type(self).__name__}(env)")
         self._check_parameters()
         self._setup_lr_schedule()
-        self.trace_schedule = FloatSchedule(self.trace_decay)
+        self.trace_schedule = make_schedule(self.trace_decay)
         # What stays as it is need not be asked for: a call more is felt in steps this short.
-        self._constant_rates = [None if callable(rate) else rate for rate in (self.learning_rate, self.trace_decay)]
+        rates = self.learning_rate, self.trace_decay
+        self._constant_rates = [rate if isinstance(rate, float) else None for rate in rates]
         self.exploration_schedule = self._make_exploration_schedule()
         unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
         if unknown:
@@ -258,10 +260,13 @@ class KNNAlgorithm(BaseAlgorithm):
         assert isinstance(table, DenseTable)
         return TorchLearner(perceiver, table, rule, self._stream, self.n_envs, form, one_step=self.trace_decay == 0.0)
 
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = make_schedule(self.learning_rate)
+
     def _check_parameters(self) -> None:
-        self.learning_rate = check_schedule("learning_rate", self.learning_rate, 0.0)
+        self.learning_rate = check_rate("learning_rate", self.learning_rate, 0.0)  # type: ignore[assignment]
         self.gamma = check_number("gamma", self.gamma, 0.0, 1.0)
-        self.trace_decay = check_schedule("trace_decay", self.trace_decay, 0.0, 1.0)
+        self.trace_decay = check_rate("trace_decay", self.trace_decay, 0.0, 1.0)
         check_word("step_size", self.step_size, ["paper", "normalized"])
         check_word("traces", self.traces, ["replacing", "accumulating"])
         check_word("tie_break", self.tie_break, ["random", "first"])

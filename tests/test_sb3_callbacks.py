@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback, EveryNTimesteps
+from stable_baselines3.common.logger import HParam
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
-from toy_envs import RecordingVecEnv
+from toy_envs import DriftEnv, RecordingVecEnv
 
 from sb3_knntd import KNNTD, ExA
 from sb3_knntd.audience import PatientCallback
@@ -241,3 +243,74 @@ def test_an_episode_that_is_reported_before_it_ends_counts(env_cls: Any, make_mo
     assert [info["r"] for info in model.ep_info_buffer] == [3.0 * lap for lap in range(1, 11)]
     # A success counts when the episode is over, as in SB3.
     assert not model.ep_success_buffer
+
+
+# ------------------------------------------------------------------ hyperparameters
+
+
+class HParamCallback(BaseCallback):
+    """The one of SB3's documentation, word for word."""
+
+    def _on_training_start(self) -> None:
+        hparam_dict = {
+            "algorithm": self.model.__class__.__name__,
+            "learning rate": self.model.learning_rate,
+            "gamma": self.model.gamma,  # type: ignore[attr-defined]
+        }
+        metric_dict = {
+            "rollout/ep_len_mean": 0,
+            "train/value_loss": 0.0,
+        }
+        self.logger.record(
+            "hparams",
+            HParam(hparam_dict, metric_dict),  # type: ignore[arg-type]
+            exclude=("stdout", "log", "json", "csv"),
+        )
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_hyperparameters_are_logged_as_sb3_says(
+    algorithm: Algorithm, make_venv: MakeVenv, tmp_path: pathlib.Path
+) -> None:
+    accumulators = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    plugin = pytest.importorskip("tensorboard.plugins.hparams.plugin_data_pb2")
+    model = algorithm(make_venv(), points=(8, 6), seed=0, tensorboard_log=str(tmp_path))
+    model.learn(200, callback=HParamCallback())
+    (folder,) = tmp_path.iterdir()
+    events = accumulators.EventAccumulator(str(folder)).Reload()
+    content = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    logged = plugin.HParamsPluginData.FromString(content).session_start_info.hparams
+    assert logged["algorithm"].string_value == algorithm.__name__
+    assert logged["learning rate"].string_value == ("lin_0.7_0.05" if algorithm is ExA else "lin_0.5_0.05")
+    assert logged["gamma"].number_value == 0.99
+
+
+@pytest.mark.parametrize("name", ["learning_rate", "trace_decay"])
+def test_a_word_is_the_schedule_that_it_says(
+    algorithm: Algorithm, make_model: MakeModel, name: str, tmp_path: pathlib.Path
+) -> None:
+    word, schedule = make_model(**{name: "lin_0.8_0.1"}), make_model(**{name: LinearSchedule(0.8, 0.1, 1.0)})
+    assert th.equal(word.learn(200).policy.q_table, schedule.learn(200).policy.q_table)
+    assert not th.equal(word.policy.q_table, make_model(**{name: 0.8}).learn(200).policy.q_table)
+    word.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env=word.get_env())
+    assert getattr(loaded, name) == "lin_0.8_0.1"
+    assert loaded.lr_schedule(0.5) == pytest.approx(0.45 if name == "learning_rate" else 0.3)
+
+
+@pytest.mark.parametrize("word", ["lin_", "lin_x", "lin_0.5_-0.1", "lin_0.5_0.1_0", "linear_0.5"])
+@pytest.mark.parametrize("name", ["learning_rate", "trace_decay"])
+def test_a_wrong_word_is_refused(make_model: MakeModel, name: str, word: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        make_model(**{name: word})
+
+
+def test_temperature_as_a_word() -> None:
+    softmax: dict[str, Any] = {"exploration": "softmax", "points": (8, 6), "seed": 0}
+    word = KNNTD(DriftEnv(), temperature="lin_2_0.1", **softmax).learn(200)
+    schedule = KNNTD(DriftEnv(), temperature=LinearSchedule(2.0, 0.1, 1.0), **softmax).learn(200)
+    assert th.equal(word.policy.q_table, schedule.policy.q_table)
+    with pytest.raises(ValueError, match="temperature"):
+        KNNTD(DriftEnv(), temperature="lin_1", **softmax)
