@@ -10,7 +10,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.checks import check_number, check_word
@@ -59,6 +58,7 @@ class ExA(KNNAlgorithm):
 
     policy: ExAPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": ExAPolicy}
+    _algorithm: ClassVar[str] = "ExA"
     _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Box
     _action_space_advice: ClassVar[str] = "For Discrete actions use KNNTD"
 
@@ -66,9 +66,9 @@ class ExA(KNNAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "KNNPolicy",
         env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = LinearSchedule(0.7, 0.05, 1.0),  # noqa: B008
+        learning_rate: float | Schedule | str = "lin_0.7_0.05",
         gamma: float = 0.99,
-        trace_decay: float | Schedule = 0.9,
+        trace_decay: float | Schedule | str = 0.9,
         n_neighbors: int | str = "auto",
         points: Any = "auto",
         bounds: Any = None,

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 
 from sb3_knntd.kernels.step import UNDRAWN, count_steps
-from sb3_knntd.memory import DenseTable, DenseTraces, OneStepTraces, Traces
+from sb3_knntd.memory import DenseTable, DenseTraces, OneStepTraces, QTable, Traces
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule, Choice
@@ -42,6 +42,7 @@ class Learner(ABC):
     """
 
     n_envs: int
+    table: QTable
     #: whether it holds where the episodes are
     in_episodes = False
 
@@ -153,6 +154,8 @@ class TorchLearner(Learner):
     :param form: which of the update's forms
     :param one_step: whether λ is 0 throughout, and no trace has to be kept
     """
+
+    table: DenseTable
 
     def __init__(
         self,

@@ -29,9 +29,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import sb3_knntd.cli
 from sb3_knntd import KNNTD, ExA
 from sb3_knntd.cli import main
+from sb3_knntd.schedules import parse_schedule
 from sb3_knntd.zoo import experiment, register
 from sb3_knntd.zoo.configuration_first import ConfigurationFirst
-from sb3_knntd.zoo.schedules import parse_schedule, with_schedules
+from sb3_knntd.zoo.schedules import with_schedules
 from sb3_knntd.zoo.search_space import CONVERTERS, OBS_DIM, SAMPLERS, attributes, study_values
 
 # SB3 silences the one when it is imported, which pytest undoes; the other is RL Zoo's word on an unnamed study.

@@ -10,6 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_knntd.kernels.memory import find_rows, rehash
+from sb3_knntd.tracing import is_traced
 
 
 class Lender(Protocol):
@@ -68,6 +69,17 @@ class QTable(nn.Module, ABC):
     def _forget_lent(self) -> None:
         if self.lender is not None:
             self.lender.forget()
+
+    def train(self, mode: bool = True) -> QTable:
+        """
+        As in torch. It brings the table up to date besides: to be exported with its values, a policy is put in
+        evaluation mode first.
+
+        :param mode: whether to train
+        :return: the table
+        """
+        self.sync()
+        return super().train(mode)
 
     @abstractmethod
     def entries(self) -> th.Tensor:
@@ -225,6 +237,12 @@ class HashedTable(QTable):
         return self.row_points[: self.n_visited]
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
+        if is_traced():
+            raise ValueError(
+                "a policy with a hashed table cannot be traced or exported: its rows are found by compiled code. Make "
+                "the model with policy_kwargs={'table': 'dense'}, and fewer points if it would not fit; predict works "
+                "with any"
+            )
         self.sync()
         found = np.empty(indices.numel(), np.int64)
         find_rows(indices.reshape(-1).numpy(), self._slots, found)

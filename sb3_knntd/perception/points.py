@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.checks import check_integer
-from sb3_knntd.perception.bounds import Bounds
+from sb3_knntd.perception.bounds import Bounds, count_states
 
 #: ``points="auto"``: a lattice of about this many points in all, with at most so many in a dimension.
 AUTO_POINTS = 8000
@@ -55,14 +55,15 @@ class Lattice(Points):
                 "Give fewer points a dimension, 1 for dimensions that matter little"
             )
         self.axes = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in self.shape]
+        self._axes = [th.from_numpy(axis) for axis in self.axes]
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
         device = bounds.low.device
         rest = th.arange(self.n_points, device=device) if indices is None else indices
         columns = []
-        for axis in reversed(self.axes):
-            columns.append(th.from_numpy(axis).to(device)[rest % len(axis)])
-            rest = rest // len(axis)
+        for axis, count in zip(reversed(self._axes), reversed(self.shape), strict=True):
+            columns.append(axis.to(device)[rest % count])
+            rest = rest // count
         return th.stack(columns[::-1], dim=1)
 
 
@@ -74,11 +75,11 @@ class Scattered(Points):
     """
 
     def __init__(self, places: np.ndarray) -> None:
-        self.places = np.array(places, dtype=np.float64)
+        self.places = th.from_numpy(np.array(places, dtype=np.float64))
         self.n_points, self.obs_dim = self.places.shape
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
-        places = th.from_numpy(self.places).to(bounds.low.device)
+        places = self.places.to(bounds.low.device)
         return bounds.scale(places if indices is None else places[indices])
 
 
@@ -86,17 +87,17 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
     """
     :param points: ``"auto"``, an int (points in every dimension), one int a dimension, or an array of
         shape (n_points, obs_dim) in observation units
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
-    :return: the points; for Discrete and MultiDiscrete one a state
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
+    :return: the points; for all but a Box one a state
     :raises ValueError: if ``points`` does not fit the space
     """
-    if isinstance(observation_space, spaces.Discrete | spaces.MultiDiscrete):
+    if isinstance(observation_space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         if not (isinstance(points, str) and points == "auto"):
             raise ValueError(
                 f"points must be 'auto' for a {type(observation_space).__name__} observation space, which has one "
                 f"point a state; got {points!r}"
             )
-        return Lattice(np.atleast_1d(getattr(observation_space, "nvec", getattr(observation_space, "n", 0))).tolist())
+        return Lattice(count_states(observation_space)[1].tolist())
 
     assert observation_space.shape is not None
     obs_dim = observation_space.shape[0]
@@ -134,7 +135,7 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
 def count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
     """
     :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for finite states
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param n_points: number of points to choose from
     :param obs_dim: number of observation dimensions
     :return: k

@@ -10,6 +10,7 @@ import torch as th
 
 from sb3_knntd.checks import check_number, check_word
 from sb3_knntd.kernels.perceive import GAUSSIAN, INVERSE_QUADRATIC
+from sb3_knntd.tracing import is_traced
 
 
 class Weights(Protocol):
@@ -74,6 +75,8 @@ class Custom:
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
         answer = self.function(squared_distances)
+        if is_traced():
+            return self._recorded(answer)
         try:
             weights = th.as_tensor(answer, dtype=th.float64, device=squared_distances.device)
         except (TypeError, ValueError, RuntimeError) as error:
@@ -90,6 +93,16 @@ class Custom:
                 f"for the squared distances {squared_distances[~_is_proper(weights)][0].tolist()}"
             )
         return weights
+
+    @staticmethod
+    def _recorded(answer: Any) -> th.Tensor:
+        """What values there will be is not known while torch records how to compute them."""
+        if not isinstance(answer, th.Tensor):
+            raise ValueError(
+                "a policy can be traced or exported if its weights are named ('inverse_quadratic', 'gaussian') or a "
+                f"function of torch operations; this one returned {type(answer).__name__}. predict works with any"
+            )
+        return answer.double()
 
 
 _BUILT_IN: dict[str, type[KernelWeights]] = {"inverse_quadratic": InverseQuadratic, "gaussian": Gaussian}
