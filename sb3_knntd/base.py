@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
+import pickle
 import sys
 import time
 from abc import abstractmethod
@@ -580,10 +581,19 @@ class KNNAlgorithm(BaseAlgorithm):
             )
         if not trusted:
             custom_objects = objects_for(path, saved, custom_objects or {}) | (custom_objects or {})
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        try:
+            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (RuntimeError, pickle.UnpicklingError, KeyError) as error:  # of a state that does not fit
+            # SB3 takes a ValueError for that of an old file of DQN, and looks in vain for an optimizer.
+            cause = error.__context__ if isinstance(error, KeyError) and error.__context__ else error
+            raise ValueError(f"{path}: {cause}") from cause
         vars(model).pop("plain", None)
         if model.n_envs != saved["n_envs"]:
             model._last_obs = None
+        elif model._last_obs is not None:
+            shape = (model.n_envs, *(model.observation_space.shape or ()))
+            if getattr(model._last_obs, "shape", None) != shape:
+                raise ValueError(f"{path}: the last observations must have shape {shape}; got {model._last_obs!r:.200}")
         if not model.learner.in_episodes:
             model._last_actions = None
         # A seed that is given begins new sequences; without one the saved ones go on.

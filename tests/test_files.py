@@ -469,3 +469,93 @@ def test_a_file_that_was_compressed_is_read(make_model: MakeModel, tmp_path: pat
     model.save(tmp_path / "model.zip")
     rewrite(tmp_path / "model.zip", lambda name, content: content, zipfile.ZIP_DEFLATED)
     type(model).load(tmp_path / "model.zip")
+
+
+# -------------------------------------------------------------------------------------------------- states made up
+
+
+@pytest.mark.parametrize("kind", ["dense", "hashed", "adaptive", "torch"])
+def test_a_state_that_was_tampered_with_is_learned_from_or_refused(tmp_path: pathlib.Path, kind: str) -> None:
+    fuzz = pathlib.Path(__file__).with_name("fuzz_states.py")
+    command = [sys.executable, str(fuzz), kind, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    # It may crash: that is what it is for.
+    assert done.returncode == 0, done.stdout[-300:] + done.stderr[-3000:]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("capacity", 10**12, r"capacity must be an integer within \[\d+, \d+\]; got 1000000000000"),
+        ("points", th.tensor([3, 3]), "points must differ"),
+        ("points", th.tensor([10**9]), r"points must be within \[0, 35\]"),
+        ("pace", th.tensor([0.0, 0.0], dtype=th.float64), "pace must begin with"),
+    ],
+)
+def test_what_is_wrong_with_a_state_is_named(
+    make_model: MakeModel, tmp_path: pathlib.Path, name: str, value: Any, message: str
+) -> None:
+    model = make_model(points=6).learn(101)
+    model.save(tmp_path / "model.zip")
+    state = model.learner.state_dict()
+    state["traces"][name] = value
+    with pytest.raises(ValueError, match=message):
+        model.learner.load_state_dict(state)
+    content = io.BytesIO()
+    th.save(state, content)
+    rewrite(tmp_path / "model.zip", lambda name, old: content.getvalue() if name == "learner.pth" else old)
+    with pytest.raises(ValueError, match=message):
+        type(model).load(tmp_path / "model.zip")
+    # The state was refused before anything of it was taken.
+    model.learn(101, reset_num_timesteps=False)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value"),
+    [
+        ("_stream_states", [{"key": [1, 2], "position": -5}] * 2),
+        ("_stream_states", [{"key": [1, 2**64], "position": 5}] * 2),
+        ("_stream_states", [{"key": [1], "position": 5}] * 2),
+        ("_stream_states", [{"key": 1.5, "position": 5}] * 2),
+        ("_last_obs", [[0.0, 0.0]]),
+        ("_last_obs", encode(np.zeros((1, 1), np.float32))),
+    ],
+)
+def test_other_data_that_cannot_be_is_refused(
+    make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, attribute: str, value: Any
+) -> None:
+    model = make_model().learn(101)
+    model.save(tmp_path / "model.zip")
+
+    def change(name: str, content: bytes) -> bytes:
+        if name != "data":
+            return content
+        data = json.loads(content)
+        if isinstance(value, dict):
+            data["plain"][attribute] = value
+        else:
+            data[attribute] = value
+        return json.dumps(data).encode()
+
+    rewrite(tmp_path / "model.zip", change)
+    with pytest.raises(ValueError, match=r"must be|must have"):
+        type(model).load(tmp_path / "model.zip", env=make_venv(1), force_reset=False, trusted=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("points", th.tensor([10**9])),
+        ("deltas", th.full((1, 3, 2), np.nan, dtype=th.float64)),
+        ("visits", th.zeros(1)),
+        ("gains", th.tensor([2.0, 2.0], dtype=th.float64)),
+        ("n_steps", "many"),
+    ],
+)
+def test_a_state_of_a_filter_that_cannot_be_is_refused(name: str, value: Any) -> None:
+    table = DeltaFilter(DriftEnv(), points=4, bounds=(DriftEnv.LOW, DriftEnv.HIGH)).table
+    state = table.state_dict()
+    state |= {"points": th.tensor([0]), "deltas": th.zeros((1, 3, 2)).double(), "visits": th.zeros((1, 3)).double()}
+    table.load_state_dict(state)
+    with pytest.raises(ValueError, match=name):
+        table.load_state_dict({**state, name: value})

@@ -64,5 +64,8 @@ def load_table(
     table = DeltaTable(*saved, Arguments(**data["arguments"]), data["bounds_from_space"])
     table.check_spaces(observation_space, action_space)
     state: dict[str, Any] = params["filter"]  # type: ignore[assignment]
-    table.load_state_dict(state)
+    try:
+        table.load_state_dict(state)
+    except RuntimeError as error:  # torch's, of bounds that do not fit
+        raise ValueError(f"{path}: {error}") from error
     return table, data["training"]
