@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
 from sb3_knntd.checks import check_integer
+from sb3_knntd.files import replace_file
 
 from .paced import PacedCallback, picture_formats
 
@@ -92,7 +93,7 @@ class EpisodeVideoCallback(PacedCallback):
             writer.flush()
         if self.folder is not None:
             path = self.folder / f"episode_{self.num_timesteps}.gif"
-            path.write_bytes(gif)
+            replace_file(path, gif)
             if self.verbose >= 1:
                 print(f"Video written to {path}")
 

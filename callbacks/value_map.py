@@ -11,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.logger import Image
 
 from sb3_knntd.checks import check_integer
+from sb3_knntd.files import replacing
 from sb3_knntd.plots import (
     Names,
     caption_of,
@@ -145,7 +146,8 @@ class ValueMapCallback(PacedCallback):
             from matplotlib.image import imsave
 
             path = self.folder / f"value_map_{self.num_timesteps}.png"
-            imsave(path, pixels)
+            with replacing(path) as file:
+                imsave(file, pixels, format="png")
             if self.verbose >= 1:
                 print(f"Value map written to {path}")
 

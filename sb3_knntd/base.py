@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
+import pickle
 import sys
 import time
 from abc import abstractmethod
@@ -19,6 +20,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import is_json_serializable
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -31,6 +33,7 @@ from sb3_knntd.kernels.step import UNDRAWN
 from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, check_finite, check_transition
 from sb3_knntd.memory import DenseTable
 from sb3_knntd.perception.bounds import steps_to_measure
+from sb3_knntd.plain import encodable, objects_for
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule
@@ -616,16 +619,26 @@ class KNNAlgorithm(BaseAlgorithm):
             self._move_on()
         try:
             if not isinstance(path, (str, pathlib.Path)):
-                super().save(path, exclude, include)
+                self._save(path, exclude, include)
                 return
             target = pathlib.Path(path)
             if not target.suffix:
                 target = target.with_name(f"{target.name}.zip")
             target.parent.mkdir(parents=True, exist_ok=True)
             with replacing(target) as file:
-                super().save(file, exclude, include)
+                self._save(file, exclude, include)
         finally:
             self._last_obs, self._last_actions = shown
+
+    def _save(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
+        """Save to an open file, and beside what SB3 pickles there the same as data, for :meth:`load` without trust."""
+        left_out = {*self._excluded_save_params(), *(exclude or ())} - set(include or ())
+        values = {name: value for name, value in vars(self).items() if name not in left_out}
+        self.plain = encodable({name: value for name, value in values.items() if not is_json_serializable(value)})
+        try:
+            super().save(file, exclude, include)
+        finally:
+            del self.plain
 
     @classmethod
     def load(
@@ -636,10 +649,15 @@ class KNNAlgorithm(BaseAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        trusted: bool = True,
         **kwargs: Any,
     ) -> SelfKNNAlgorithm:
         """
         Load a model from a zip file.
+
+        SB3's format has pickled objects in it, and to read them is to run what the file says: by default a file is
+        trusted as a program is. With ``trusted=False`` nothing is unpickled; spaces, schedules of SB3, arrays and
+        numbers are read as data, which :meth:`save` has stored beside.
 
         :param path: file, or file-like object
         :param env: environment to go on with; ``None`` to predict only. Its number may differ from the saved
@@ -648,9 +666,11 @@ class KNNAlgorithm(BaseAlgorithm):
         :param print_system_info: whether to print the system it was saved on
         :param force_reset: whether ``learn`` starts new episodes; ``False`` goes on in the middle of the saved
             ones, for an environment that is in the state it was in
+        :param trusted: whether to unpickle what the file holds; ``False`` for files of others
         :param kwargs: attributes to change; with ``seed`` the random numbers begin anew
         :return: the model
-        :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has
+        :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has; without
+            trust also if it holds functions or other objects that are there only as pickles
         """
         saved = read_description(path)
         if saved.get("algorithm") != cls._algorithm:
@@ -658,11 +678,23 @@ class KNNAlgorithm(BaseAlgorithm):
                 f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls._algorithm}: "
                 "load it with its own class"
             )
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if not trusted:
+            custom_objects = objects_for(path, saved, custom_objects or {}) | (custom_objects or {})
+        try:
+            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (RuntimeError, pickle.UnpicklingError, KeyError) as error:  # of a state that does not fit
+            # SB3 takes a ValueError for that of an old file of DQN, and looks in vain for an optimizer.
+            cause = error.__context__ if isinstance(error, KeyError) and error.__context__ else error
+            raise ValueError(f"{path}: {cause}") from cause
+        vars(model).pop("plain", None)
         if env is not None:
             model._check_normalization(model.env)
         if model.n_envs != saved["n_envs"]:
             model._last_obs = None
+        elif model._last_obs is not None:
+            shape = (model.n_envs, *(model.observation_space.shape or ()))
+            if getattr(model._last_obs, "shape", None) != shape:
+                raise ValueError(f"{path}: the last observations must have shape {shape}; got {model._last_obs!r:.200}")
         if not model.learner.in_episodes:
             model._last_actions = None
         # A seed that is given begins new sequences; without one the saved ones go on.

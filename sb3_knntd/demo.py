@@ -8,7 +8,7 @@ import signal
 import time
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -20,8 +20,12 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.cli import CommandError
+from sb3_knntd.files import replacing
 from sb3_knntd.knntd import KNNTD
 from sb3_knntd.plots import figure_of, plot_learning_curve, plot_value_function, telling_dims
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EVAL_EPISODES = 100
 #: Predicting for several environments at once takes hardly longer than for one.
@@ -153,10 +157,10 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
     )
     axes.set_xlim(right=steps)
     figure_of(axes).suptitle(f"KNNTD on {env_id}")
-    figure_of(axes).savefig(files["learning curve"])
+    _save_picture(figure_of(axes), files["learning curve"])
     if isinstance(loaded.observation_space, spaces.Box) and loaded.observation_space.shape[0] >= 2:
         files["value function"] = out / f"{stem}_value_function.png"
-        figure_of(plot_value_function(loaded, telling_dims(loaded))[0]).savefig(files["value function"])
+        _save_picture(figure_of(plot_value_function(loaded, telling_dims(loaded))[0]), files["value function"])
     print()
     _print_files(files)
     print(f"See the log with: tensorboard --logdir {shlex.quote(str(out / 'tensorboard'))}")
@@ -166,6 +170,11 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
 def _evaluate(policy: PolicyPredictor, env: VecEnv) -> np.ndarray:
     returns, _ = evaluate_policy(policy, env, EVAL_EPISODES, deterministic=True, return_episode_rewards=True)
     return np.asarray(returns)
+
+
+def _save_picture(figure: Figure, path: Path) -> None:
+    with replacing(path) as file:
+        figure.savefig(file, format="png")
 
 
 def _print_returns(title: str, returns: dict[str, np.ndarray]) -> None:

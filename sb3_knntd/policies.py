@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -131,7 +131,7 @@ class KNNPolicy(BasePolicy):
                 f"points: a table of {places.n_points} points needs the compiled step, which works on the CPU with "
                 "numba and with weights that are no function. Give fewer points, or policy_kwargs={'table': 'dense'}"
             )
-        return HashedTable(n_actions, initial_value, dtype)
+        return HashedTable(places.n_points, n_actions, initial_value, dtype)
 
     @property
     def is_compiled(self) -> bool:
@@ -300,6 +300,8 @@ class KNNPolicy(BasePolicy):
         return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        if not isinstance(state_dict, Mapping):
+            raise ValueError(f"the state of a policy must be a dict of tensors; got {str(state_dict)[:100]}")
         answer = super().load_state_dict(state_dict, strict, assign)
         # Saved bounds may differ from those of the space, where they were measured.
         self.perceiver.fit()

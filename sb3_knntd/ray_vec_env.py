@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
 from sb3_knntd.checks import check_integer, check_number
+from sb3_knntd.files import replace_file
 
 try:
     import ray
@@ -88,7 +89,7 @@ class EnvActor:
         if file and before and not file.read_bytes().startswith(before):
             # The new Monitor has begun the file anew. SB3's load_results reads this one beside it.
             stem = file.name.removesuffix(Monitor.EXT)
-            file.with_name(f"{stem}before_restart_{restarts}.{Monitor.EXT}").write_bytes(before)
+            replace_file(file.with_name(f"{stem}before_restart_{restarts}.{Monitor.EXT}"), before)
         for name, value in attributes.items():
             self.set_attr(name, cloudpickle.loads(value))
         monitor = unwrap_wrapper(self.env, Monitor)

@@ -561,7 +561,7 @@ def test_weights_and_schedules_are_saved(tmp_path: pathlib.Path) -> None:
     venv = VecDeltaFilter(make_venv(), **arguments)
     walk(venv, 100)
     venv.save(tmp_path / "filter")
-    loaded = VecDeltaFilter.load(tmp_path / "filter", make_venv())
+    loaded = VecDeltaFilter.load(tmp_path / "filter", make_venv(), trusted=True)
     assert loaded.table.rate() == pytest.approx(0.2 * 0.8)
     venv.set_venv(make_venv())
     np.testing.assert_array_equal(walk(venv, 50)[0], walk(loaded, 50)[0])

@@ -164,14 +164,17 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
         save_table(path, self.table, self.training)
 
     @classmethod
-    def load(cls, path: str | pathlib.Path, env: gym.Env[np.ndarray, Any]) -> DeltaFilter:
+    def load(cls, path: str | pathlib.Path, env: gym.Env[np.ndarray, Any], trusted: bool = False) -> DeltaFilter:
         """
         :param path: file that a :class:`DeltaFilter` or a :class:`VecDeltaFilter` has saved
         :param env: the environment to filter
+        :param trusted: whether to unpickle functions that the file holds (``weights``, ``learning_rate``), which
+            is to run what it says
         :return: the filter as it was
-        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``env`` has
+        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``env`` has;
+            without trust also if it holds functions
         """
-        return cls._around(env, *load_table(path, env.observation_space, env.action_space))
+        return cls._around(env, *load_table(path, env.observation_space, env.action_space, trusted))
 
     @classmethod
     def _around(cls, env: gym.Env[np.ndarray, Any], table: DeltaTable, training: bool) -> DeltaFilter:

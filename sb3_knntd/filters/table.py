@@ -17,6 +17,7 @@ from sb3_knntd.perception import Perceiver, make_bounds, make_points, make_weigh
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.perception.points import AUTO_POINTS_PER_DIMENSION, count_neighbors
 from sb3_knntd.perception.search import make_search
+from sb3_knntd.states import checked_integer, checked_points, checked_tensor
 
 #: ``points="auto"``: a lattice of about this many points, fewer than a learner's: each entry has to average noise.
 AUTO_POINTS = 2000
@@ -269,8 +270,18 @@ class DeltaTable:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """
         :param state_dict: of a table with the same spaces and arguments
+        :raises ValueError: if no such table can have returned it
         """
-        visited = state_dict["points"].numpy()
+        points = checked_points(state_dict, "points", len(self.deltas))
+        shape = (len(points), *self.visits.shape[1:])
+        checked_tensor(state_dict, "deltas", (*shape, self.obs_dim), th.float64)
+        checked_tensor(state_dict, "visits", shape, th.float64, 0.0)
+        checked_tensor(state_dict, "gains", (self.obs_dim,), th.float64, 0.0, 1.0)
+        checked_tensor(state_dict, "variances", (self.obs_dim,), th.float64)
+        checked_tensor(state_dict, "counts", (1,), th.float64, 0.0)
+        for name in ("n_measured", "n_steps"):
+            checked_integer(state_dict, name, 0, 2**62)
+        visited = points.numpy()
         self.deltas[:], self.visits[:] = 0.0, 0.0
         self.deltas[visited], self.visits[visited] = state_dict["deltas"].numpy(), state_dict["visits"].numpy()
         for name in ("gains", "variances", "counts"):

@@ -10,6 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_knntd.kernels.memory import find_rows, rehash
+from sb3_knntd.states import checked_points, checked_tensor
 from sb3_knntd.tracing import is_traced
 
 
@@ -200,9 +201,12 @@ class DenseTable(QTable):
         no_points, no_slots = np.empty(0, np.int64), np.empty((0, 2), np.int64)
         return self.values.numpy(), self.visited.numpy(), no_points, no_slots, self.initial_value
 
-    def _load_from_state_dict(self, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        # What is missing or has another shape torch tells of.
+        if prefix + "values" in state_dict:
+            checked_tensor(state_dict, prefix + "values", (None, None))
         self._forget_lent()
-        super()._load_from_state_dict(*args)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
 
 class HashedTable(QTable):
@@ -210,6 +214,7 @@ class HashedTable(QTable):
     A row for every point that has been learned at, made then; all others are worth the initial value. For
     lattices larger than memory. On the CPU only.
 
+    :param n_points: number of points that may get a row
     :param n_actions: number of columns
     :param initial_value: what every entry is at the start
     :param dtype: floating type of the entries
@@ -219,8 +224,9 @@ class HashedTable(QTable):
 
     row_points: th.Tensor
 
-    def __init__(self, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
+    def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
+        self.n_points = n_points
         self.register_buffer("values", th.empty((0, n_actions), dtype=dtype))
         self.register_buffer("row_points", th.empty(0, dtype=th.int64))
         self._resize(self.SMALLEST)
@@ -292,7 +298,8 @@ class HashedTable(QTable):
             destination[prefix + name] = destination[prefix + name][: self.n_visited].clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        self._refill(state_dict[prefix + "row_points"], state_dict[prefix + "values"])
+        points = checked_points(state_dict, prefix + "row_points", self.n_points)
+        self._refill(points, checked_tensor(state_dict, prefix + "values", (len(points), self.n_actions)))
         whole = {prefix + name: getattr(self, name).clone() for name in ("values", "row_points")}
         super()._load_from_state_dict({**state_dict, **whole}, prefix, *args)
 

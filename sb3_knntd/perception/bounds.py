@@ -9,6 +9,8 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
+from sb3_knntd.states import checked_tensor
+
 #: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
 LARGEST_SENSIBLE_BOUND = 1e10
 #: A range is widened by this share beyond what was seen, since a better policy sees more than a random one.
@@ -67,6 +69,17 @@ class Bounds(nn.Module):
         self.register_buffer("highest", th.from_numpy(np.where(sensible, high, np.inf)), persistent=False)
         self.register_buffer("seen_low", th.full_like(self.low, th.inf))
         self.register_buffer("seen_high", th.full_like(self.low, -th.inf))
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        # What is missing torch tells of.
+        if all(prefix + name in state_dict for name in self.state_dict()):
+            shape = (self.obs_dim,)
+            low, high = (checked_tensor(state_dict, prefix + name, shape) for name in ("low", "high"))
+            for name in ("seen_low", "seen_high"):
+                checked_tensor(state_dict, prefix + name, shape, finite=False)
+            if not (low < high).all() or not th.isfinite(high - low).all():
+                raise ValueError(f"{prefix}low must be below {prefix}high; got {low.tolist()} and {high.tolist()}")
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def is_open(self) -> bool:
