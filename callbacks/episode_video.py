@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
-from sb3_knntd.checks import check_integer
+from sb3_knntd.checks import check_integer, check_path, shown
 
 from .paced import PacedCallback, picture_formats
 
@@ -53,6 +53,11 @@ class EpisodeVideoCallback(PacedCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__("video_freq", video_freq, verbose)
+        if not isinstance(eval_env, (gym.Env, VecEnv)):
+            raise ValueError(
+                "eval_env must be an environment, e.g. gymnasium.make(id, render_mode='rgb_array'); got "
+                f"{shown(eval_env)}"
+            )
         self.eval_env = eval_env if isinstance(eval_env, VecEnv) else DummyVecEnv([lambda: eval_env])
         if self.eval_env.num_envs != 1:
             raise ValueError(f"eval_env must be one environment; got {self.eval_env.num_envs} of them")
@@ -61,7 +66,7 @@ class EpisodeVideoCallback(PacedCallback):
                 f"eval_env must have render_mode='rgb_array'; got {self.eval_env.render_mode!r}. Make it with "
                 "gymnasium.make(id, render_mode='rgb_array')"
             )
-        self.folder = None if folder is None else Path(folder)
+        self.folder = None if folder is None else check_path("folder", folder)
         self.max_steps = check_integer("max_steps", max_steps, 1)
 
     def _init_callback(self) -> None:

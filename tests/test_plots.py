@@ -66,7 +66,7 @@ def test_running_median() -> None:
     np.testing.assert_array_equal(running_median([5.0, 1.0, 3.0, 9.0, 2.0], 3), [5, 3, 3, 3, 3])
     np.testing.assert_array_equal(running_median([5.0, 1.0], 1), [5, 1])
     assert len(running_median([], 3)) == 0
-    with pytest.raises(ValueError, match="window must be at least 1; got 0"):
+    with pytest.raises(ValueError, match="window must be an integer >= 1; got 0"):
         running_median([1.0], 0)
 
 
@@ -241,7 +241,7 @@ def test_telling_dimensions_are_those_the_value_changes_along() -> None:
         ({"dims": (0, 1, 2)}, "dims must be two different"),
         ({"fixed": {1: 0.5}}, r"fixed must name dimensions .* other than those drawn, \(0, 1\); got {1: 0.5}"),
         ({"fixed": {7: 0.5}}, "fixed must name dimensions"),
-        ({"resolution": 0}, "resolution must be at least 1; got 0"),
+        ({"resolution": 0}, "resolution must be an integer from 1 to 4096; got 0"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(arguments: dict[str, Any], message: str) -> None:
