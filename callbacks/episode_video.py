@@ -40,6 +40,7 @@ class EpisodeVideoCallback(PacedCallback):
     :param max_steps: an episode is recorded up to this step
     :param verbose: 1 for a line whenever a file is written
     :raises ValueError: if an argument does not fit; when training begins, if the video has nowhere to go
+    :raises ImportError: when training begins, if Pillow is not installed
     """
 
     FIRST_SECONDS: ClassVar[float] = 1.0
@@ -70,6 +71,11 @@ class EpisodeVideoCallback(PacedCallback):
         self.max_steps = check_integer("max_steps", max_steps, 1)
 
     def _init_callback(self) -> None:
+        # To be known before hours of training.
+        try:
+            import PIL.Image  # noqa: F401
+        except ImportError as error:
+            raise ImportError('videos need Pillow: pip install "sb3-knntd[extra]"') from error
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
 

@@ -67,6 +67,7 @@ class ValueMapCallback(PacedCallback):
     :param verbose: 1 for a line whenever a file is written
     :raises ValueError: if an argument does not fit; when training begins, if the observations are not a Box of two or
         more dimensions, ``dims``, ``fixed`` or ``names`` do not fit them, or pictures have nowhere to go
+    :raises ImportError: when training begins, if matplotlib is not installed
     """
 
     FIRST_SECONDS: ClassVar[float] = 0.4
@@ -94,7 +95,7 @@ class ValueMapCallback(PacedCallback):
         self._footprints = Footprints(self.dims, self.resolution, self.n_routes)
 
     def _init_callback(self) -> None:
-        # What does not fit is to be known before hours of training.
+        # What does not fit or is not there is to be known before hours of training.
         value_grid(self.model, self.dims, self.fixed, 1, self.average)
         names_for(self.model, self.names)
         new_figure(1.0, 1.0)

@@ -230,11 +230,11 @@ def plot_learning_curve(
     :return: the axes drawn on; :func:`figure_of` tells their figure
     :raises ValueError: if ``steps`` and ``returns`` differ in length
     """
-    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
-
     if len(steps) != len(returns):
         raise ValueError(f"steps and returns must be of the same length; got {len(steps)} and {len(returns)}")
     axes = axes if axes is not None else new_figure(7.0, 4.2).add_subplot()
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
     if len(returns) == 0:
         axes.text(0.5, 0.75, "no episode has ended", transform=axes.transAxes, ha="center", va="center")
     else:
@@ -427,8 +427,12 @@ def new_figure(width: float, height: float) -> Figure:
     :param width: inches
     :param height: inches
     :return: a figure that belongs to no window and to no global state; save it with ``figure.savefig(path)``
+    :raises ImportError: if matplotlib is not installed
     """
-    from matplotlib.figure import Figure
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('pictures need matplotlib: pip install "sb3-knntd[extra]"') from error
 
     return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
 
