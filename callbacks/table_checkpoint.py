@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_integer
+from sb3_knntd.checks import check_flag, check_integer, check_name, check_path
 from sb3_knntd.files import read_description, replacing, sweep
 from sb3_knntd.plain import class_name, loaded_class
 
@@ -77,10 +77,10 @@ class TableCheckpointCallback(PacedCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__("save_freq", save_freq, verbose)
-        self.save_path = Path(save_path)
+        self.save_path = check_path("save_path", save_path)
         self.n_last = check_integer("n_last", n_last, 1)
-        self.save_best = save_best
-        self.name_prefix = name_prefix
+        self.save_best = check_flag("save_best", save_best)
+        self.name_prefix = check_name("name_prefix", name_prefix)
         #: mean return of the best so far, ``None`` before there is one
         self.best_mean_reward: float | None = None
 

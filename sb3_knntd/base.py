@@ -7,6 +7,7 @@ import pathlib
 import pickle
 import sys
 import time
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from math import isfinite
@@ -22,11 +23,20 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import is_json_serializable
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_knntd.audience import Audience
-from sb3_knntd.checks import check_number, check_word
+from sb3_knntd.checks import (
+    PROGRESS,
+    check_flag,
+    check_integer,
+    check_number,
+    check_path,
+    check_verbose,
+    check_word,
+    shown,
+)
 from sb3_knntd.compiled_learner import CompiledLearner
 from sb3_knntd.files import read_description, replacing
 from sb3_knntd.kernels.step import UNDRAWN
@@ -42,6 +52,8 @@ from sb3_knntd.schedules import check_rate, make_schedule
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
 NONE_TRUNCATED: dict[int, np.ndarray] = {}
+#: What NumPy's global generator takes.
+LARGEST_SEED = 2**32 - 1
 
 
 class KNNAlgorithm(BaseAlgorithm):
@@ -91,6 +103,11 @@ class KNNAlgorithm(BaseAlgorithm):
         seed: int | None,
         device: th.device | str,
     ) -> None:
+        verbose = check_verbose(verbose)
+        stats_window_size = check_integer("stats_window_size", stats_window_size, 1)
+        if tensorboard_log is not None:
+            check_path("tensorboard_log", tensorboard_log)
+        device = check_device(device)
         policy_class, env = self._sort_out(policy, env)
         if env is not None:
             env = maybe_make_env(env, verbose)
@@ -222,10 +239,10 @@ class KNNAlgorithm(BaseAlgorithm):
         rates = self.learning_rate, self.trace_decay
         self._constant_rates = [rate if isinstance(rate, float) else None for rate in rates]
         self.exploration_schedule = self._make_exploration_schedule()
-        unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
-        if unknown:
+        known = {"dtype", "table", "compiled"}
+        if not (isinstance(self.policy_kwargs, dict) and self.policy_kwargs.keys() <= known):
             raise ValueError(
-                f"policy_kwargs takes 'dtype', 'table' and 'compiled'; got {', '.join(map(repr, sorted(unknown)))}"
+                f"policy_kwargs must be a dict of 'dtype', 'table' and 'compiled'; got {shown(self.policy_kwargs)}"
             )
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
@@ -242,6 +259,7 @@ class KNNAlgorithm(BaseAlgorithm):
             **self._policy_arguments(),
             **self.policy_kwargs,
         ).to(self.device)
+        self._warn_of_overshooting()
         self._rule = rule = self._make_rule()
         self._stream = RandomStream((self.n_envs, 2, rule.n_uniforms))
         self._prediction_stream = RandomStream((rule.n_uniforms,), purpose=1)
@@ -273,8 +291,7 @@ class KNNAlgorithm(BaseAlgorithm):
         check_word("step_size", self.step_size, ["paper", "normalized"])
         check_word("traces", self.traces, ["replacing", "accumulating"])
         check_word("tie_break", self.tie_break, ["random", "first"])
-        if not isinstance(self.reset_other_actions, (bool, np.bool_)):
-            raise ValueError(f"reset_other_actions must be True or False; got {self.reset_other_actions!r}")
+        check_flag("reset_other_actions", self.reset_other_actions)
 
     def _make_epsilon_schedule(self) -> Schedule:
         initial = check_number("exploration_initial_eps", self.exploration_initial_eps, 0.0, 1.0)
@@ -308,13 +325,28 @@ class KNNAlgorithm(BaseAlgorithm):
                 "normalise them. Wrap it with what was known of them: VecNormalize.load(path, env)"
             )
 
+    def _warn_of_overshooting(self) -> None:
+        """Of step sizes that carry a value beyond what it is moved towards."""
+        highest = max(self.lr_schedule(progress) for progress in PROGRESS)
+        # An update removes the share α of the TD error if it is normalised, otherwise α Σp², which is α/k at least.
+        most = 1 if self.step_size == "normalized" else self.policy.n_neighbors
+        if highest > most:
+            warnings.warn(
+                f"learning_rate={highest:g} with step_size={self.step_size!r} moves values beyond what they are "
+                f"learned from, and they may diverge: give at most {most}",
+                stacklevel=4,
+            )
+
     def set_random_seed(self, seed: int | None = None) -> None:
         """
         Seed Python, NumPy, torch, the environment, the action space, and the learner's own numbers.
 
-        :param seed: the seed; ``None`` leaves all but the learner's own as they are, which start anew from the
-            operating system's entropy
+        :param seed: the seed, from 0 to 2³² - 1; ``None`` leaves all but the learner's own as they are, which start
+            anew from the operating system's entropy
+        :raises ValueError: if it is no such number
         """
+        if seed is not None:
+            seed = check_integer("seed", seed, 0, LARGEST_SEED)
         super().set_random_seed(seed)
         self._stream.seed(seed)
         self._prediction_stream.seed(seed)
@@ -371,9 +403,11 @@ class KNNAlgorithm(BaseAlgorithm):
         :param reset_num_timesteps: whether to count steps from 0; if not, training goes on where it was
         :param progress_bar: whether to show a progress bar (tqdm and rich)
         :return: the model
-        :raises ValueError: if an environment returns an observation or reward that is not finite. The table is
-            untouched by that step
+        :raises ValueError: if ``total_timesteps`` is no number, or an environment returns an observation or reward that
+            is not finite. The table is untouched by that step
         """
+        # As SB3, which takes 1e6 as well, and does nothing for numbers below 1; but NaN would be no steps, unnoticed.
+        check_number("total_timesteps", total_timesteps)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -711,6 +745,25 @@ def normalizes_observations(env: GymEnv | None) -> bool:
     """
     normalizer = unwrap_vec_normalize(env)  # type: ignore[arg-type]
     return normalizer is not None and normalizer.norm_obs
+
+
+def check_device(device: Any) -> th.device:
+    """
+    :param device: what was given
+    :return: the device it means; the CPU for CUDA where there is none, as in SB3
+    :raises ValueError: if there is no such device, or it cannot hold a table
+    """
+    error: Exception | None = None
+    if isinstance(device, (str, th.device)):
+        try:
+            found = get_device(device)
+            # Some devices hold no float64, and some nothing at all.
+            th.zeros(1, dtype=th.float64, device=found).item()
+        except (AssertionError, RuntimeError, TypeError, ValueError) as raised:
+            error = raised
+        else:
+            return found
+    raise ValueError(f"device must be 'cpu', 'cuda', 'auto' or another of torch's; got {shown(device)}") from error
 
 
 def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:

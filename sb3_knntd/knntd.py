@@ -11,7 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_word
+from sb3_knntd.checks import LEAST, check_word
 from sb3_knntd.exploration import EXPLORATIONS
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.rules import ActionRule, DiscreteRule
@@ -53,7 +53,7 @@ class KNNTD(KNNAlgorithm):
         the values over to where a lattice's points then are and letting go the traces
     :param weights: ``"inverse_quadratic"``: 1 / (1 + d²/h²), eq. 5; ``"gaussian"``: exp(-d²/2h²); or a function from
         squared distances (batch, k), scaled units, to weights (batch, k), both torch tensors
-    :param bandwidth: h of the weights, > 0, scaled units (the bounds are 2 wide)
+    :param bandwidth: h of the weights, >= 1e-100, scaled units (the bounds are 2 wide)
     :param search: how neighbours are found, all exactly but ``"hnsw"``: ``"brute"``, ``"lattice"``, ``"kd_tree"``,
         ``"hnsw"`` (approximate, extra ``[ann]``), or ``"auto"``
     :param step_size: ``"paper"`` for α as in eq. 13, ``"normalized"`` for α / Σp², which makes α the share of the TD
@@ -67,15 +67,15 @@ class KNNTD(KNNAlgorithm):
     :param exploration_initial_eps: ε at the start, in [0, 1]
     :param exploration_final_eps: ε at the end, in [0, 1]
     :param exploration_fraction: share of the training over which ε changes, in (0, 1]
-    :param temperature: of softmax, > 0, in units of return, or a function or word as for ``learning_rate``
+    :param temperature: of softmax, >= 1e-100, in units of return, or a function or word as for ``learning_rate``
     :param tie_break: which of several equal best actions is taken while training: ``"random"`` or ``"first"``
-    :param initial_value: Q at the start; above what is attainable it makes the learner explore
-    :param stats_window_size: number of episodes that the logged means are over
+    :param initial_value: Q at the start, up to ±1e30; above what is attainable it makes the learner explore
+    :param stats_window_size: number >= 1 of episodes that the logged means are over
     :param tensorboard_log: folder for TensorBoard, ``None`` for no log
     :param policy_kwargs: ``dtype`` (``torch.float64`` or ``torch.float32``), ``table`` (``"auto"``, ``"dense"``,
         ``"hashed"``) and ``compiled`` (``False`` for the torch reference), see :class:`~sb3_knntd.KNNPolicy`
     :param verbose: 0 for no output, 1 for information, 2 for debugging
-    :param seed: seed of all random numbers
+    :param seed: seed of all random numbers, from 0 to 2³² - 1
     :param device: where perception and table are; on the CPU the step is compiled
     :param _init_setup_model: whether to build the table at once
     :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
@@ -163,7 +163,7 @@ class KNNTD(KNNAlgorithm):
     def _make_exploration_schedule(self) -> Schedule:
         check_word("exploration", self.exploration, EXPLORATIONS)
         epsilon = self._make_epsilon_schedule()
-        self.temperature = check_rate("temperature", self.temperature, 0.0, above=True)
+        self.temperature = check_rate("temperature", self.temperature, LEAST)
         return make_schedule(self.temperature) if self.exploration == "softmax" else epsilon
 
     def learn(

@@ -15,7 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_knntd.actions import ActionColumns, make_action_columns
-from sb3_knntd.checks import check_number, check_word
+from sb3_knntd.checks import check_flag, check_number, check_size, check_word, shown
 from sb3_knntd.exploration import greedy
 from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.step import best_entries
@@ -29,6 +29,8 @@ from sb3_knntd.tracing import is_traced
 
 #: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
 DENSE_TABLE_BYTES = 2**28
+#: Action values are taken up to this: sums of them stay finite in float32 too.
+LARGEST_VALUE = 1e30
 
 
 class KNNPolicy(BasePolicy):
@@ -80,9 +82,10 @@ class KNNPolicy(BasePolicy):
         columns: ActionColumns | None = None,
     ) -> None:
         super().__init__(observation_space, action_space)
-        check_number("initial_value", initial_value)
-        if dtype not in (th.float32, th.float64):
-            raise ValueError(f"policy_kwargs: dtype must be torch.float64 or torch.float32; got {dtype!r}")
+        initial_value = check_number("initial_value", initial_value, -LARGEST_VALUE, LARGEST_VALUE)
+        if not isinstance(dtype, th.dtype) or dtype not in (th.float32, th.float64):
+            raise ValueError(f"policy_kwargs: dtype must be torch.float64 or torch.float32; got {shown(dtype)}")
+        compiled = check_flag("policy_kwargs: compiled", compiled)
         self._arguments = {
             "n_neighbors": n_neighbors,
             "points": points,
@@ -118,19 +121,35 @@ class KNNPolicy(BasePolicy):
         #: what each column of the table stands for
         self.columns = columns
         self.table = self._make_table(table, places, int(columns.blocks[-1]), initial_value, dtype)
+        check_size(
+            f"n_neighbors: the action values of {self.n_neighbors} neighbours",
+            8 * self.n_neighbors * int(columns.blocks[-1]),
+            "give fewer neighbours",
+        )
 
     def _make_table(self, table: str, places: Points, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
         check_word("policy_kwargs: table", table, ["auto", "dense", "hashed"])
+        row_bytes = n_actions * dtype.itemsize
         if table == "auto":
-            fits = places.n_points * n_actions * dtype.itemsize <= DENSE_TABLE_BYTES
+            fits = places.n_points * row_bytes <= DENSE_TABLE_BYTES
             table = "dense" if fits or not isinstance(places, Lattice) else "hashed"
         if table == "dense":
+            check_size(
+                f"points: a dense table of {places.n_points} points and {n_actions} actions",
+                places.n_points * row_bytes,
+                "give fewer points, or a lattice with policy_kwargs={'table': 'hashed'}",
+            )
             return DenseTable(places.n_points, n_actions, initial_value, dtype)
         if not self._compilable:
             raise ValueError(
                 f"points: a table of {places.n_points} points needs the compiled step, which works on the CPU with "
                 "numba and with weights that are no function. Give fewer points, or policy_kwargs={'table': 'dense'}"
             )
+        check_size(
+            f"action_points, action space: the first {HashedTable.SMALLEST} rows of a table of {n_actions} actions",
+            HashedTable.SMALLEST * row_bytes,
+            "have fewer actions",
+        )
         return HashedTable(places.n_points, n_actions, initial_value, dtype)
 
     @property

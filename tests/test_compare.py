@@ -289,14 +289,22 @@ def test_algorithms_fit_by_their_actions() -> None:
         (["--threshold", "high"], "--threshold: could not convert string to float: 'high'"),
         (["--threshold", "inf"], "--threshold must be finite; got MountainCar-v0=inf"),
         (["--threshold", "CartPole-v1=3"], "--threshold: 'CartPole-v1' is not among MountainCar-v0"),
+        (["--env", "no_such_module:Env-v0"], "--env: 'no_such_module:Env-v0' cannot be made: No module named"),
         (["--gym-packages", "no_such_module"], "--gym-packages: No module named 'no_such_module'"),
+        (["--gym-packages", "raising_module"], "--gym-packages: RuntimeError: no licence for this"),
         (["--backend", "ray", "--cpus-per-run", "-1"], "must be a number above 0; got '-1'"),
         (["--first-seed", "2147483640"], "seeds go to 2147483647; got 10 from 2147483640 on"),
     ],
 )
 def test_a_mistake_is_told_of_before_anything_is_computed(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    (tmp_path / "raising_module.py").write_text("raise RuntimeError('no licence for this')")
+    monkeypatch.syspath_prepend(tmp_path)
     command = ["compare", "--env", "MountainCar-v0", "--algos", "knntd", "--out", str(tmp_path / "out"), *arguments]
     with pytest.raises(SystemExit, match="2"):
         main(command)

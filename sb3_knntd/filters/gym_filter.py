@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from sb3_knntd.checks import check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
 from sb3_knntd.filters.table import Arguments, DeltaTable
@@ -81,6 +82,7 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
         training: bool = True,
         compiled: bool = True,
     ) -> None:
+        training = check_flag("training", training)
         arguments = Arguments(
             learning_rate=learning_rate,
             update=update,

@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_knntd.checks import check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
 from sb3_knntd.filters.table import Arguments, DeltaTable
@@ -62,6 +63,7 @@ class VecDeltaFilter(VecEnvWrapper):
         training: bool = True,
         compiled: bool = True,
     ) -> None:
+        training = check_flag("training", training)
         arguments = Arguments(
             learning_rate=learning_rate,
             update=update,

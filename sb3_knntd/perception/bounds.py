@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
+from sb3_knntd.checks import check_numbers, shown
 from sb3_knntd.states import checked_tensor
 
 #: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
@@ -177,14 +178,16 @@ def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space
     if not isinstance(observation_space, spaces.Box):
         raise ValueError(
             f"bounds must be None for a {type(observation_space).__name__} observation space, whose states are "
-            f"the points; got {bounds!r}"
+            f"the points; got {shown(bounds)}"
         )
     if isinstance(bounds, str) and bounds == "adaptive":
         return Bounds(*((low, high) if from_space else unbounded), adaptive=True)
     try:
-        given_low, given_high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
+        given_low, given_high = (check_numbers("bounds", bound) for bound in bounds)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"bounds must be None, 'adaptive', or a pair (low, high) of arrays; got {bounds!r}") from error
+        raise ValueError(
+            f"bounds must be None, 'adaptive', or a pair (low, high) of arrays of numbers; got {shown(bounds)}"
+        ) from error
     for name, given in (("low", given_low), ("high", given_high)):
         if given.shape != low.shape:
             raise ValueError(
