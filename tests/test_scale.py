@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from reference import NearestPoints
+from knn_td_from_scratch import NearestPoints
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
