@@ -640,7 +640,7 @@ def in_a_new_process(**environment: str) -> dict[str, Any]:
     run = subprocess.run(
         [sys.executable, "-c", IN_A_NEW_PROCESS],
         cwd=pathlib.Path(__file__).parent,
-        env={**os.environ, **environment},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
         capture_output=True,
         text=True,
         timeout=300,
