@@ -14,10 +14,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from delta_filter_from_scratch import PaperFilter
 from gymnasium import spaces
+from knn_td_from_scratch import NearestPoints
 from numpy.typing import NDArray
-from reference import NearestPoints
-from reference_filter import ReferenceFilter
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -148,7 +148,7 @@ def test_equals_algorithm_5(n_envs: int, reference: str, update: str | None, com
     venv = VecDeltaFilter(
         make_venv(n_envs), reference=reference, update=update, compiled=compiled, **PERCEPTION, **PAPER
     )
-    model = ReferenceFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2, own_errors=update == "averaging")
+    model = PaperFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2, own_errors=update == "averaging")
     observations, actions, dones, infos = walk(venv, 60)
     last = [raw.copy() for raw in observations[0]]
     for seen, action, done, info in zip(observations[1:], actions, dones, infos, strict=True):
@@ -185,7 +185,7 @@ def test_the_environment_wrapper_equals_the_vec_wrapper() -> None:
 def test_a_schedule_goes_over_its_steps() -> None:
     arguments = {**PERCEPTION, **PAPER, "learning_rate": lambda progress: progress, "total_timesteps": 40}
     env = DeltaFilter(Noisy(lengths=(100,)), **arguments)
-    model = ReferenceFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2)
+    model = PaperFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2)
     last, _ = env.reset()
     for step in range(50):
         seen, _, _, _, info = env.step(step % 3)

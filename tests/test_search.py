@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import lattice, squared_distances
+from knn_td_from_scratch import lattice, squared_distances
 from toy_envs import StillEnv
 
 from sb3_knntd import KNNTD

@@ -18,8 +18,8 @@ import rl_zoo3
 from sb3_knntd.cli import CommandError, make_env, reason_of
 from sb3_knntd.compare.configurations import FLOOR, Configuration, configuration, fits, label
 from sb3_knntd.compare.experiment import experiment, prepare
-from sb3_knntd.compare.report import Comparison, make_report
-from sb3_knntd.compare.results import Run, Task, make_groups
+from sb3_knntd.compare.report import make_report
+from sb3_knntd.compare.results import Comparison, Run, Task, make_groups
 from sb3_knntd.compare.run import run
 from sb3_knntd.files import replace_file
 from sb3_knntd.jobs import Backend, Job, Outcome, run_jobs, run_locally, usable_cores
