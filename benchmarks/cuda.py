@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from benchmarks.speed import Row
+from benchmarks.rows import Row
 from sb3_knntd.exploration import EpsilonGreedy
 from sb3_knntd.learner import Form, TorchLearner
 from sb3_knntd.policies import KNNPolicy
@@ -73,11 +73,9 @@ def against_copy(repeats: int) -> list[Row]:
         ),
     }
     return [
-        Row(
+        Row.of(
             f"{what}: its bandwidth over that of a copy",
-            statistics.median(rates) / copy,
-            min(rates) / copy,
-            max(rates) / copy,
+            [rate / copy for rate in rates],
             ">= 0",
             f"{statistics.median(rates) / 1e9:.0f} / {copy / 1e9:.0f} GB/s on {th.cuda.get_device_name()}",
         )

@@ -14,7 +14,7 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +25,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
+from benchmarks.cuda import against_copy
 from benchmarks.machine import describe
+from benchmarks.rows import Row
 from sb3_knntd import KNNTD, ExA
 
 
@@ -59,32 +61,6 @@ class Drift(gym.Env[np.ndarray, Any]):
         return self.state, -1.0, self.steps >= self.length, False, {}
 
 
-class Row(NamedTuple):
-    """
-    One line of the table.
-
-    :param what: what was compared
-    :param ratio: the median ratio
-    :param low: the lowest of the repeats
-    :param high: the highest of the repeats
-    :param target: ``">= x"`` or ``"<= x"``
-    :param detail: the two things' own figures
-    """
-
-    what: str
-    ratio: float
-    low: float
-    high: float
-    target: str
-    detail: str
-
-    @property
-    def reached(self) -> bool:
-        """Whether the median reaches the target."""
-        sign, limit = self.target.split()
-        return bool(self.ratio >= float(limit) if sign == ">=" else self.ratio <= float(limit))
-
-
 def compare(
     what: str, target: str, one: Callable[[], float], other: Callable[[], float], repeats: int, unit: str
 ) -> Row:
@@ -100,7 +76,7 @@ def compare(
     pairs = [(one(), other()) for _ in range(repeats)]
     ratios = [a / b for a, b in pairs]
     a, b = (statistics.median(column) for column in zip(*pairs, strict=True))
-    return Row(what, statistics.median(ratios), min(ratios), max(ratios), target, f"{a:,.4g} / {b:,.4g} {unit}")
+    return Row.of(what, ratios, target, f"{a:,.4g} / {b:,.4g} {unit}")
 
 
 def steps_per_second(work: Callable[[int], Any], n_steps: int) -> float:
@@ -271,11 +247,9 @@ def long_episode(repeats: int, continuous: bool) -> Row:
         ratios.append(last / first)
         details.append((last * 1e3, first * 1e3))
     last, first = (statistics.median(column) for column in zip(*details, strict=True))
-    return Row(
+    return Row.of(
         f"{'ExA: ' if continuous else ''}an episode of 10^5 steps, λ 0.99, γ 1: its last steps over its first",
-        statistics.median(ratios),
-        min(ratios),
-        max(ratios),
+        ratios,
         "<= 1.1",
         f"{last:.4g} / {first:.4g} µs",
     )
@@ -336,11 +310,9 @@ def start_up(repeats: int) -> Row:
         printed = subprocess.run([sys.executable, "-c", START_UP], capture_output=True, text=True, check=True).stdout
         runs.append([float(number) for number in printed.split()])
     sb3, ours = zip(*runs[1:], strict=True)
-    return Row(
+    return Row.of(
         "import, construction and first step beyond importing SB3, seconds",
-        statistics.median(ours),
-        min(ours),
-        max(ours),
+        ours,
         "<= 1",
         f"importing SB3 takes {statistics.median(sb3):.2f} s",
     )
@@ -363,11 +335,9 @@ def memory(repeats: int, dtype: th.dtype) -> Row:
         return (tensor_bytes + live_bytes) / (10**6 * 3 * dtype.itemsize)
 
     ratios = [measure() for _ in range(min(repeats, 2))]
-    return Row(
+    return Row.of(
         f"table and traces over n_points × n_actions × bytes, 10^6 points, {dtype}",
-        statistics.median(ratios),
-        min(ratios),
-        max(ratios),
+        ratios,
         "<= 1.1",
         "after 20,000 steps",
     )
@@ -393,11 +363,9 @@ def growth_pause(repeats: int) -> Row:
         model.learn(20_000, callback=watch)
         pauses.append(watch.longest)
         rows = model.policy.table.n_visited
-    return Row(
+    return Row.of(
         "longest step while a hashed table grows, seconds",
-        statistics.median(pauses),
-        min(pauses),
-        max(pauses),
+        pauses,
         "<= 0.1",
         f"{rows:,} rows at the end",
     )
@@ -408,8 +376,6 @@ def cuda(repeats: int) -> list[Row]:
     if not th.cuda.is_available():
         print("device='cuda' is left out: there is no such device here", file=sys.stderr)
         return []
-    from benchmarks.cuda import against_copy
-
     return against_copy(repeats)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
-from sb3_knntd.checks import check_integer
+from sb3_knntd.checks import check_integer, check_path, shown
+from sb3_knntd.files import replace_file
 
 from .paced import PacedCallback, picture_formats
 
@@ -40,6 +41,7 @@ class EpisodeVideoCallback(PacedCallback):
     :param max_steps: an episode is recorded up to this step
     :param verbose: 1 for a line whenever a file is written
     :raises ValueError: if an argument does not fit; when training begins, if the video has nowhere to go
+    :raises ImportError: when training begins, if Pillow is not installed
     """
 
     FIRST_SECONDS: ClassVar[float] = 1.0
@@ -53,6 +55,11 @@ class EpisodeVideoCallback(PacedCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__("video_freq", video_freq, verbose)
+        if not isinstance(eval_env, (gym.Env, VecEnv)):
+            raise ValueError(
+                "eval_env must be an environment, e.g. gymnasium.make(id, render_mode='rgb_array'); got "
+                f"{shown(eval_env)}"
+            )
         self.eval_env = eval_env if isinstance(eval_env, VecEnv) else DummyVecEnv([lambda: eval_env])
         if self.eval_env.num_envs != 1:
             raise ValueError(f"eval_env must be one environment; got {self.eval_env.num_envs} of them")
@@ -61,10 +68,15 @@ class EpisodeVideoCallback(PacedCallback):
                 f"eval_env must have render_mode='rgb_array'; got {self.eval_env.render_mode!r}. Make it with "
                 "gymnasium.make(id, render_mode='rgb_array')"
             )
-        self.folder = None if folder is None else Path(folder)
+        self.folder = None if folder is None else check_path("folder", folder)
         self.max_steps = check_integer("max_steps", max_steps, 1)
 
     def _init_callback(self) -> None:
+        # To be known before hours of training.
+        try:
+            import PIL.Image  # noqa: F401
+        except ImportError as error:
+            raise ImportError('videos need Pillow: pip install "sb3-knntd[extra]"') from error
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
 
@@ -92,7 +104,7 @@ class EpisodeVideoCallback(PacedCallback):
             writer.flush()
         if self.folder is not None:
             path = self.folder / f"episode_{self.num_timesteps}.gif"
-            path.write_bytes(gif)
+            replace_file(path, gif)
             if self.verbose >= 1:
                 print(f"Video written to {path}")
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.logger import HParam
 
 from sb3_knntd.audience import PatientCallback
+from sb3_knntd.checks import check_verbose, shown
 
 from .paced import picture_formats, write
 
@@ -34,13 +35,14 @@ class HParamCallback(PatientCallback):
 
     :param metrics: names of the scalars; with EvalCallback ``"eval/mean_reward"`` is worth adding
     :param verbose: has no effect
-    :raises ValueError: if ``metrics`` is empty; when training begins, if the model does not log to TensorBoard
+    :raises ValueError: if an argument does not fit; when training begins, if the model does not log to TensorBoard
     """
 
     def __init__(self, metrics: Sequence[str] = METRICS, verbose: int = 0) -> None:
-        super().__init__(verbose)
-        if isinstance(metrics, str) or not metrics:
-            raise ValueError(f"metrics must be names of scalars, e.g. {METRICS[:2]}; got {metrics!r}")
+        super().__init__(check_verbose(verbose))
+        is_several = isinstance(metrics, Collection) and not isinstance(metrics, (str, bytes)) and len(metrics) > 0
+        if not (is_several and all(isinstance(metric, str) for metric in metrics)):
+            raise ValueError(f"metrics must be names of scalars, e.g. {METRICS[:2]}; got {shown(metrics)}")
         self.metrics = tuple(metrics)
 
     def _on_training_start(self) -> None:

@@ -10,7 +10,7 @@ from stable_baselines3.common.logger import CSVOutputFormat, HumanOutputFormat, 
 
 from sb3_knntd.audience import PatientCallback
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_integer
+from sb3_knntd.checks import check_integer, check_verbose
 
 #: ``freq=None``: calls between two looks at the clock.
 CALLS_BETWEEN_LOOKS = 128
@@ -23,7 +23,7 @@ class PacedCallback(PatientCallback):
     :param name: name of the argument that ``freq`` was given as
     :param freq: act every ``freq`` calls (of n_envs steps each); ``None``: as often as takes :attr:`SHARE` of the time
     :param verbose: 0 for no output, 1 for a line whenever a file is written
-    :raises ValueError: if ``freq`` is neither ``None`` nor an integer >= 1
+    :raises ValueError: if ``freq`` is neither ``None`` nor an integer >= 1, or ``verbose`` does not fit
     """
 
     model: KNNAlgorithm
@@ -34,7 +34,7 @@ class PacedCallback(PatientCallback):
     FIRST_SECONDS: ClassVar[float]
 
     def __init__(self, name: str, freq: int | None, verbose: int) -> None:
-        super().__init__(verbose)
+        super().__init__(check_verbose(verbose))
         self.freq = None if freq is None else check_integer(name, freq, 1)
 
     def init_callback(self, model: Any) -> None:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import pickle
-import secrets
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import Any, ClassVar
 
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
@@ -18,12 +19,18 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_integer
+from sb3_knntd.checks import check_flag, check_integer, check_name, check_path
+from sb3_knntd.files import read_description, replacing, sweep
+from sb3_knntd.plain import class_name, loaded_class
 
 from .paced import PacedCallback
 
-#: What a checkpoint has besides the model: a dict of the classes and the best mean return, and what wrappers saved.
-NOTES = "checkpoint.pkl"
+#: What a checkpoint has besides the model: names of the classes and the mean return, and what wrappers saved.
+NOTES = "checkpoint.json"
+#: What the notes were before they were JSON.
+OLD_NOTES = "checkpoint.pkl"
+#: Bytes; they are a few hundred.
+LARGEST_NOTES = 2**20
 WRAPPER = "vec_env_wrapper_{}.pkl"
 
 
@@ -70,10 +77,10 @@ class TableCheckpointCallback(PacedCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__("save_freq", save_freq, verbose)
-        self.save_path = Path(save_path)
+        self.save_path = check_path("save_path", save_path)
         self.n_last = check_integer("n_last", n_last, 1)
-        self.save_best = save_best
-        self.name_prefix = name_prefix
+        self.save_best = check_flag("save_best", save_best)
+        self.name_prefix = check_name("name_prefix", name_prefix)
         #: mean return of the best so far, ``None`` before there is one
         self.best_mean_reward: float | None = None
 
@@ -84,9 +91,8 @@ class TableCheckpointCallback(PacedCallback):
 
     def _init_callback(self) -> None:
         self.save_path.mkdir(parents=True, exist_ok=True)
-        # What a crash left half written.
-        for part in self.save_path.glob(f".{self.name_prefix}_*.part"):
-            part.unlink()
+        # It may be long before there is a better one.
+        sweep(self.best_path)
 
     def _on_training_start(self) -> None:
         steps = _steps_of(self.save_path, self.name_prefix)
@@ -104,11 +110,12 @@ class TableCheckpointCallback(PacedCallback):
         path = _path_of(self.save_path, self.name_prefix, self.num_timesteps)
         episodes = self.model.ep_info_buffer
         mean_reward = float(safe_mean([episode["r"] for episode in episodes])) if episodes else None
-        _write_whole(path, lambda file: _save(file, self.model, mean_reward))
+        with replacing(path) as file:
+            _save(file, self.model, mean_reward)
         best = self.best_mean_reward
         if self.save_best and mean_reward is not None and (best is None or mean_reward > best):
-            with open(path, "rb") as saved:
-                _write_whole(self.best_path, lambda file: shutil.copyfileobj(saved, file))
+            with open(path, "rb") as saved, replacing(self.best_path) as file:
+                shutil.copyfileobj(saved, file)
             self.best_mean_reward = mean_reward
         for step in _steps_of(self.save_path, self.name_prefix)[: -self.n_last]:
             _path_of(self.save_path, self.name_prefix, step).unlink()
@@ -121,6 +128,7 @@ class TableCheckpointCallback(PacedCallback):
         env: GymEnv | str,
         name_prefix: str = "checkpoint",
         force_reset: bool = True,
+        trusted: bool = True,
         **kwargs: Any,
     ) -> KNNAlgorithm:
         """
@@ -135,10 +143,13 @@ class TableCheckpointCallback(PacedCallback):
         :param name_prefix: what the files' names begin with
         :param force_reset: whether new episodes begin. ``False`` is for an environment that is still in the state it
             was in: learning then goes on as if it had not been interrupted, to the bit
+        :param trusted: whether to unpickle what the file holds, see :meth:`~sb3_knntd.KNNTD.load`. Without trust a
+            VecNormalize, which is saved by pickle, cannot be brought back; a VecDeltaFilter can
         :param kwargs: other arguments of :meth:`~sb3_knntd.KNNTD.load`
         :return: the model; its environment is ``model.get_env()``
         :raises FileNotFoundError: if there is no checkpoint
-        :raises ValueError: if the file is damaged or no checkpoint, or ``env`` has other spaces
+        :raises ValueError: if the file is damaged or no checkpoint, ``env`` has other spaces, a class of the model or
+            of a wrapper has not been imported, or without trust something would have to be unpickled
         """
         file = Path(path)
         if not file.is_file():
@@ -147,13 +158,15 @@ class TableCheckpointCallback(PacedCallback):
                 raise FileNotFoundError(f"no checkpoint {name_prefix}_*_steps.zip in {file}")
             file = _path_of(file, name_prefix, steps[-1])
         notes = _read_notes(file)
+        read_description(file)
+        algorithm: type[KNNAlgorithm] = loaded_class(notes["algorithm"], KNNAlgorithm)
         venv = KNNAlgorithm._wrap_env(maybe_make_env(env, verbose=0), verbose=0)
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(file) as archive:
             # From the inside out, as each is put around what is there by then.
-            for index, wrapper in reversed(list(enumerate(notes["wrappers"]))):
-                venv = _rewrap(venv, wrapper, archive.extract(WRAPPER.format(index), folder))
-        model: KNNAlgorithm = notes["algorithm"].load(file, env=venv, force_reset=force_reset, **kwargs)
-        return model
+            for index, name in reversed(list(enumerate(notes["wrappers"]))):
+                wrapper = loaded_class(name, VecEnvWrapper)
+                venv = _rewrap(venv, wrapper, archive.extract(WRAPPER.format(index), folder), trusted)
+        return algorithm.load(file, env=venv, force_reset=force_reset, trusted=trusted, **kwargs)
 
 
 def _path_of(folder: Path, name_prefix: str, step: int) -> Path:
@@ -168,12 +181,13 @@ def _steps_of(folder: Path, name_prefix: str) -> list[int]:
     return sorted(int(number) for number in numbers if number.isdecimal())
 
 
-def _save(file: IO[bytes], model: KNNAlgorithm, mean_reward: float | None) -> None:
-    model.save(file)  # type: ignore[arg-type]
+def _save(file: io.BufferedRandom, model: KNNAlgorithm, mean_reward: float | None) -> None:
+    model.save(file)
     wrappers = _saveable_wrappers(model.get_env())
-    notes = {"algorithm": type(model), "wrappers": [type(w) for w in wrappers], "mean_reward": mean_reward}
+    names = [class_name(type(wrapper)) for wrapper in wrappers]
+    notes = {"algorithm": class_name(type(model)), "wrappers": names, "mean_reward": mean_reward}
     with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(file, "a") as archive:
-        archive.writestr(NOTES, pickle.dumps(notes))
+        archive.writestr(NOTES, json.dumps(notes))
         for index, wrapper in enumerate(wrappers):
             saved = os.path.join(folder, WRAPPER.format(index))
             wrapper.save(saved)
@@ -191,41 +205,53 @@ def _saveable_wrappers(venv: VecEnv | None) -> list[Any]:
     return wrappers
 
 
-def _rewrap(venv: VecEnv, wrapper: type[Any], saved: str) -> VecEnv:
+def _rewrap(venv: VecEnv, wrapper: type[Any], saved: str, trusted: bool) -> VecEnv:
     """Load a wrapper from where it was saved, in the place of that of its class, or around everything."""
+    takes_trust = "trusted" in signature(wrapper.load).parameters
+    if not (trusted or takes_trust):
+        raise ValueError(
+            f"a {wrapper.__name__} is saved by pickle, and to read it would be to run what the file says. If you trust "
+            "whom it is from, give trusted=True"
+        )
+    how = {"trusted": trusted} if takes_trust else {}
     around: list[VecEnvWrapper] = []
     inner = venv
     while isinstance(inner, VecEnvWrapper) and type(inner) is not wrapper:
         around.append(inner)
         inner = inner.venv
     if not isinstance(inner, VecEnvWrapper):
-        loaded: VecEnv = wrapper.load(saved, venv)
+        loaded: VecEnv = wrapper.load(saved, venv, **how)
         return loaded
-    loaded = wrapper.load(saved, inner.venv)
+    loaded = wrapper.load(saved, inner.venv, **how)
     if not around:
         return loaded
     around[-1].venv = loaded
     return venv
 
 
-def _write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
-    """Write a file beside, and give it its name when it is whole and on the disk."""
-    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    try:
-        with open(part, "x+b") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+class _Names(pickle.Unpickler):
+    """Reads what consists of names and numbers; nothing is imported or called."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """
+        :param module: of a class
+        :param name: of the class
+        :return: its name, which stands for it
+        """
+        return f"{module}.{name}"
 
 
 def _read_notes(path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as archive:
-            notes: dict[str, Any] = pickle.loads(archive.read(NOTES))
-    except (zipfile.BadZipFile, KeyError, EOFError) as error:
+            is_json = NOTES in archive.namelist()
+            with archive.open(NOTES if is_json else OLD_NOTES) as file:
+                content = file.read(LARGEST_NOTES)
+        notes: dict[str, Any] = json.loads(content) if is_json else _Names(io.BytesIO(content)).load()
+        mean_reward = notes["mean_reward"]
+        if not (mean_reward is None or isinstance(mean_reward, int | float)) or not isinstance(notes["wrappers"], list):
+            raise ValueError(f"its notes are {notes!r}")
+    # Whatever a pickle that is none does to its reader.
+    except Exception as error:
         raise ValueError(f"{path} is no checkpoint, or was cut off: {error}") from error
     return notes

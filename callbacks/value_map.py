@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from stable_baselines3.common.logger import Image
 
-from sb3_knntd.checks import check_integer
+from sb3_knntd.checks import check_flag, check_integer, check_path
+from sb3_knntd.files import replacing
 from sb3_knntd.plots import (
+    FINEST,
     Names,
     caption_of,
+    check_dims,
+    check_fixed,
+    check_names,
     count_panels,
     names_for,
     new_figure,
@@ -57,12 +62,13 @@ class ValueMapCallback(PacedCallback):
     :param draw_freq: draw every so many calls (of n_envs steps each); ``None``: as often as takes a thousandth
         of the time, which is a few times in an hour
     :param n_routes: how many episodes are drawn, the last ones
-    :param resolution: number of cells in each of the two dimensions
+    :param resolution: number of cells in each of the two dimensions, up to 4096
     :param folder: where to write ``value_map_{steps}.png``; ``None`` for no files
     :param names: what dimensions and actions are called; ``None`` for what is known of the environment
     :param verbose: 1 for a line whenever a file is written
     :raises ValueError: if an argument does not fit; when training begins, if the observations are not a Box of two or
         more dimensions, ``dims``, ``fixed`` or ``names`` do not fit them, or pictures have nowhere to go
+    :raises ImportError: when training begins, if matplotlib is not installed
     """
 
     FIRST_SECONDS: ClassVar[float] = 0.4
@@ -80,17 +86,17 @@ class ValueMapCallback(PacedCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__("draw_freq", draw_freq, verbose)
-        self.dims = dims
-        self.fixed = fixed
-        self.average = average
+        self.dims = check_dims(dims)
+        self.fixed = check_fixed(fixed)
+        self.average = check_flag("average", average)
         self.n_routes = check_integer("n_routes", n_routes, 0)
-        self.resolution = check_integer("resolution", resolution, 1)
-        self.folder = None if folder is None else Path(folder)
-        self.names = names
-        self._footprints = Footprints(dims, self.resolution, self.n_routes)
+        self.resolution = check_integer("resolution", resolution, 1, FINEST)
+        self.folder = None if folder is None else check_path("folder", folder)
+        self.names = check_names(names)
+        self._footprints = Footprints(self.dims, self.resolution, self.n_routes)
 
     def _init_callback(self) -> None:
-        # What does not fit is to be known before hours of training.
+        # What does not fit or is not there is to be known before hours of training.
         value_grid(self.model, self.dims, self.fixed, 1, self.average)
         names_for(self.model, self.names)
         new_figure(1.0, 1.0)
@@ -145,7 +151,8 @@ class ValueMapCallback(PacedCallback):
             from matplotlib.image import imsave
 
             path = self.folder / f"value_map_{self.num_timesteps}.png"
-            imsave(path, pixels)
+            with replacing(path) as file:
+                imsave(file, pixels, format="png")
             if self.verbose >= 1:
                 print(f"Value map written to {path}")
 

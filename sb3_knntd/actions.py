@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from sb3_knntd.checks import check_integer, check_word
+from sb3_knntd.checks import check_integer, check_numbers, check_size, check_word, in_bytes, shown
 
 #: ``action_table=None``: all combinations of the action points up to so many, one table a dimension beyond.
 MOST_JOINT_COLUMNS = 128
@@ -61,7 +61,7 @@ def make_action_columns(action_space: spaces.Box, action_points: Any, action_tab
         if n_joint > MOST_COLUMNS:
             raise ValueError(
                 f"action_table='joint' would need {n_joint:,} columns for {len(lists)} action dimensions, "
-                f"{n_joint * 8 // 2**20:,} MiB for each point visited: use action_table='factored', or fewer "
+                f"{in_bytes(8 * n_joint)} for each point visited: use action_table='factored', or fewer "
                 "action_points"
             )
         return ActionColumns(np.array(list(product(*lists))), np.array([0, n_joint]), lists)
@@ -74,36 +74,43 @@ def make_action_columns(action_space: spaces.Box, action_points: Any, action_tab
 
 def _by_dimension(action_points: Any, action_dim: int) -> list[Any]:
     if isinstance(action_points, str):
-        raise ValueError(f"action_points must be an int, one int a dimension, or arrays; got {action_points!r}")
-    if not isinstance(action_points, (list, tuple)) and np.ndim(action_points) == 0:
+        raise ValueError(f"action_points must be an int, one int a dimension, or arrays; got {shown(action_points)}")
+    if _is_single(action_points):
         return [check_integer("action_points", action_points, 2)] * action_dim
     given = list(action_points)
     # For one dimension the list of points itself may stand for the list of lists.
-    if action_dim == 1 and given and all(np.ndim(point) == 0 for point in given) and len(given) != 1:
+    if action_dim == 1 and given and all(map(_is_single, given)) and len(given) != 1:
         return [given]
     if len(given) != action_dim:
         raise ValueError(
             f"action_points: an int or an array for each of the {action_dim} action dimensions is needed; got "
-            f"{len(given)}: {action_points!r}"
+            f"{len(given)}: {shown(action_points)}"
         )
     return given
 
 
 def _points_of_dimension(dimension: int, given: Any, low: float, high: float, dtype: Any) -> np.ndarray:
     name = f"action_points of dimension {dimension}"
-    if not isinstance(given, (list, tuple)) and np.ndim(given) == 0:
-        return np.linspace(low, high, check_integer(name, given, 2))
-    try:
-        points = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be numbers; got {given!r}") from error
+    if _is_single(given):
+        n_points = check_integer(name, given, 2)
+        # Each is a column of the table, and an action besides.
+        check_size(f"{name}: {n_points} points", 3 * 8 * n_points, "give fewer")
+        return np.linspace(low, high, n_points)
+    points = check_numbers(name, given)
     if points.ndim != 1 or len(points) == 0:
-        raise ValueError(f"{name} must be a list of at least one number; got {given!r}")
-    # A bound of the space is what its type made of the number that was meant, 0.7 in float32 say.
-    for bound in (low, high):
-        points = np.where(points.astype(dtype) == bound, bound, points)
+        raise ValueError(f"{name} must be a list of at least one number; got {shown(given)}")
+    # A bound of the space is what its type made of the number that was meant, 0.7 in float32 say. What the type cannot
+    # hold is no bound.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for bound in (low, high):
+            points = np.where(points.astype(dtype) == bound, bound, points)
     if not np.isfinite(points).all() or points.min() < low or points.max() > high:
-        raise ValueError(f"{name} must lie within the action space, [{low:g}, {high:g}]; got {points.tolist()}")
+        raise ValueError(f"{name} must lie within the action space, [{low:g}, {high:g}]; got {shown(points.tolist())}")
     if np.any(np.diff(points) <= 0):
-        raise ValueError(f"{name} must rise; got {points.tolist()}")
+        raise ValueError(f"{name} must rise; got {shown(points.tolist())}")
     return points
+
+
+def _is_single(value: Any) -> bool:
+    """Whether it is no array of any kind, nor a list that could be made one."""
+    return not isinstance(value, (list, tuple)) and np.ndim(value) == 0

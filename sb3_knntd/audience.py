@@ -50,13 +50,17 @@ class Audience:
     """
 
     def __init__(self, callback: BaseCallback) -> None:
-        #: all of them, without the lists that they are in
-        self.members = list(_leaves(callback))
+        #: all of them, and the lists that they are in
+        self.members = list(_members(callback))
+        lists = [member for member in self.members if type(member) is CallbackList]
         self._patient = [member for member in self.members if isinstance(member, PatientCallback)]
         self._recorders = [record for member in self._patient if (record := member.recorder()) is not None]
         #: those who are told of every step
-        self.listeners = [member for member in self.members if not isinstance(member, PatientCallback)]
+        self.listeners = [member for member in self.members if member not in [*self._patient, *lists]]
         self._any_listens = bool(self.listeners)
+        # Lists only count, at every step if one of their members may look.
+        self._counting_each_step = lists if self._any_listens else []
+        self._catching_up = [*self._patient, *([] if self._any_listens else lists)]
         self._n_untold = 0
         self._patience = self._wait()
 
@@ -80,6 +84,9 @@ class Audience:
         :return: whether to go on
         """
         go_on = True
+        for each in self._counting_each_step:
+            each.n_calls += 1
+            each.num_timesteps = num_timesteps
         for listener in self.listeners:
             listener.update_locals(locals_)
             go_on = listener.on_step() and go_on
@@ -94,13 +101,13 @@ class Audience:
 
     def catch_up(self, num_timesteps: int) -> None:
         """
-        Let the patient ones count the steps that they were not told of.
+        Let those count the steps who were not told of them.
 
         :param num_timesteps: number of environment steps
         """
-        for patient in self._patient:
-            patient.n_calls += self._n_untold
-            patient.num_timesteps = num_timesteps
+        for each in self._catching_up:
+            each.n_calls += self._n_untold
+            each.num_timesteps = num_timesteps
         self._n_untold = 0
 
     def _wait(self) -> int:
@@ -108,10 +115,10 @@ class Audience:
         return min([patient.due_at - patient.n_calls for patient in self._patient], default=sys.maxsize)
 
 
-def _leaves(callback: BaseCallback) -> Iterator[BaseCallback]:
-    """The callbacks that lists consist of, but for the one that stands for none."""
+def _members(callback: BaseCallback) -> Iterator[BaseCallback]:
+    """The callback and, if it is a list, all that are in it, but for the one that stands for none."""
+    if not (isinstance(callback, ConvertCallback) and callback.callback is None):
+        yield callback
     if type(callback) is CallbackList:
         for each in callback.callbacks:
-            yield from _leaves(each)
-    elif not (isinstance(callback, ConvertCallback) and callback.callback is None):
-        yield callback
+            yield from _members(each)

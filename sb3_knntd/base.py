@@ -4,38 +4,56 @@ from __future__ import annotations
 
 import io
 import pathlib
+import pickle
 import sys
 import time
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from math import isfinite
 from statistics import fmean
 from typing import Any, ClassVar, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import is_json_serializable
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import LinearSchedule, get_device
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_knntd.audience import Audience
-from sb3_knntd.checks import check_number, check_schedule, check_word
+from sb3_knntd.checks import (
+    PROGRESS,
+    check_flag,
+    check_integer,
+    check_number,
+    check_path,
+    check_verbose,
+    check_word,
+    shown,
+)
 from sb3_knntd.compiled_learner import CompiledLearner
 from sb3_knntd.files import read_description, replacing
 from sb3_knntd.kernels.step import UNDRAWN
 from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, check_finite, check_transition
 from sb3_knntd.memory import DenseTable
 from sb3_knntd.perception.bounds import steps_to_measure
+from sb3_knntd.plain import encodable, objects_for
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule
+from sb3_knntd.schedules import check_rate, make_schedule
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
 NONE_TRUNCATED: dict[int, np.ndarray] = {}
+#: What NumPy's global generator takes.
+LARGEST_SEED = 2**32 - 1
 
 
 class KNNAlgorithm(BaseAlgorithm):
@@ -53,6 +71,8 @@ class KNNAlgorithm(BaseAlgorithm):
     exploration_final_eps: float
     exploration_fraction: float
 
+    #: What a saved file calls the algorithm: subclasses read each other's.
+    _algorithm: ClassVar[str]
     #: What an action space must be, and what to do with another.
     _supported_action_space: ClassVar[type[spaces.Space[Any]]]
     _action_space_advice: ClassVar[str]
@@ -62,9 +82,9 @@ class KNNAlgorithm(BaseAlgorithm):
         policy: str | type[BasePolicy] | GymEnv,
         env: GymEnv | str | None,
         *,
-        learning_rate: float | Schedule,
+        learning_rate: float | Schedule | str,
         gamma: float,
-        trace_decay: float | Schedule,
+        trace_decay: float | Schedule | str,
         n_neighbors: int | str,
         points: Any,
         bounds: Any,
@@ -83,6 +103,11 @@ class KNNAlgorithm(BaseAlgorithm):
         seed: int | None,
         device: th.device | str,
     ) -> None:
+        verbose = check_verbose(verbose)
+        stats_window_size = check_integer("stats_window_size", stats_window_size, 1)
+        if tensorboard_log is not None:
+            check_path("tensorboard_log", tensorboard_log)
+        device = check_device(device)
         policy_class, env = self._sort_out(policy, env)
         if env is not None:
             env = maybe_make_env(env, verbose)
@@ -90,7 +115,7 @@ class KNNAlgorithm(BaseAlgorithm):
         super().__init__(
             policy_class,
             env,
-            learning_rate,
+            learning_rate,  # type: ignore[arg-type]
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -100,7 +125,7 @@ class KNNAlgorithm(BaseAlgorithm):
             seed=seed,
         )
         #: Which algorithm a saved file is of.
-        self.algorithm = type(self).__name__
+        self.algorithm = self._algorithm
         self.gamma = gamma
         self.trace_decay = trace_decay
         self.n_neighbors = n_neighbors
@@ -115,9 +140,14 @@ class KNNAlgorithm(BaseAlgorithm):
         self.tie_break = tie_break
         self.initial_value = initial_value
 
+        # Where the points lie depends on it.
+        self._normalized = normalizes_observations(self.env)
         #: ε or the temperature at the last step
         self.exploration_rate = 0.0
         self._last_actions: np.ndarray | None = None
+        # What the last step led to, and while callbacks are told of a step what was acted on in it.
+        self._standing: np.ndarray | None = None
+        self._acted_on: np.ndarray | None = None
         self._n_measured = 0
         self._measuring = False
 
@@ -140,25 +170,43 @@ class KNNAlgorithm(BaseAlgorithm):
         cls, policy: str | type[BasePolicy] | GymEnv, env: GymEnv | str | None
     ) -> tuple[type[KNNPolicy], GymEnv | str | None]:
         """Tell policy and environment apart: either order of giving them works."""
-        call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{next(iter(cls.policy_aliases))}", env)'
+        name = next(iter(cls.policy_aliases))
+        default: type[KNNPolicy] = cls.policy_aliases[name]  # type: ignore[assignment]
+        call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{name}", env)'
+        for given in (policy, env):
+            if isinstance(given, type) and issubclass(given, (gym.Env, gym.vector.VectorEnv, VecEnv)):
+                raise ValueError(
+                    f"env must be an environment; got the class {given.__name__}. Make one of it: "
+                    f"{cls.__name__}({given.__name__}(...))"
+                )
+            if isinstance(given, gym.vector.VectorEnv):
+                raise ValueError(
+                    f"{cls.__name__} takes SB3's VecEnv, and environments of gymnasium.vector are none; got {given!r}. "
+                    "In place of gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
+                )
         if isinstance(policy, str) and policy in cls.policy_aliases:
             policy = cls.policy_aliases[policy]
         if isinstance(policy, str) and policy.endswith("Policy"):
             raise ValueError(
-                f"{cls.__name__} has no {policy!r}: it learns a table and has no network to choose. Call {call}"
+                f"{cls.__name__} has no {policy!r}: its one policy is named {name!r}, as it learns a table and has no "
+                f"network to choose. Call {call}"
             )
         if isinstance(policy, type):
-            if not issubclass(policy, KNNPolicy):
-                raise ValueError(f"policy must be a KNNPolicy; got {policy.__name__}. Call {call}")
+            if not (issubclass(policy, default) and policy.acts_in is cls._supported_action_space):
+                raise ValueError(
+                    f"policy of {cls.__name__} must be {default.__name__} or a subclass with actions in a "
+                    f"{cls._supported_action_space.__name__}; got {policy.__name__}. Call {call}"
+                )
             return policy, env
         if env is not None:
             raise ValueError(f"two environments were given, {policy!r} and {env!r}. Call {call}")
-        return next(iter(cls.policy_aliases.values())), policy  # type: ignore[return-value]
+        return default, policy
 
     @classmethod
     def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         discrete = isinstance(observation_space, spaces.Discrete) or (
-            isinstance(observation_space, spaces.MultiDiscrete) and observation_space.nvec.ndim == 1
+            isinstance(observation_space, spaces.MultiDiscrete | spaces.MultiBinary)
+            and len(observation_space.shape or ()) == 1
         )
         vector = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
         if not (discrete or (vector and observation_space.shape != (0,))):
@@ -172,8 +220,8 @@ class KNNAlgorithm(BaseAlgorithm):
             else:
                 advice = "Map it to a Box of shape (n,) with gymnasium.wrappers.TransformObservation"
             raise ValueError(
-                f"{cls.__name__} takes observations in a Box of shape (n,), Discrete or MultiDiscrete of one axis; "
-                f"got {observation_space}. {advice}"
+                f"{cls.__name__} takes observations in a Box of shape (n,), Discrete, or MultiDiscrete or MultiBinary "
+                f"of one axis; got {observation_space}. {advice}"
             )
         if not isinstance(action_space, cls._supported_action_space):
             raise ValueError(
@@ -186,15 +234,15 @@ class KNNAlgorithm(BaseAlgorithm):
             raise ValueError(f"env must be given to build a model: {type(self).__name__}(env)")
         self._check_parameters()
         self._setup_lr_schedule()
-        self.trace_schedule = FloatSchedule(self.trace_decay)
+        self.trace_schedule = make_schedule(self.trace_decay)
         # What stays as it is need not be asked for: a call more is felt in steps this short.
-        self._constant_rates = [None if callable(rate) else rate for rate in (self.learning_rate, self.trace_decay)]
+        rates = self.learning_rate, self.trace_decay
+        self._constant_rates = [rate if isinstance(rate, float) else None for rate in rates]
         self.exploration_schedule = self._make_exploration_schedule()
-        normalizes = self._vec_normalize_env is not None and self._vec_normalize_env.norm_obs
-        unknown = set(self.policy_kwargs) - {"dtype", "table", "compiled"}
-        if unknown:
+        known = {"dtype", "table", "compiled"}
+        if not (isinstance(self.policy_kwargs, dict) and self.policy_kwargs.keys() <= known):
             raise ValueError(
-                f"policy_kwargs takes 'dtype', 'table' and 'compiled'; got {', '.join(map(repr, sorted(unknown)))}"
+                f"policy_kwargs must be a dict of 'dtype', 'table' and 'compiled'; got {shown(self.policy_kwargs)}"
             )
         self.policy = self.policy_class(  # type: ignore[assignment]
             self.observation_space,
@@ -207,10 +255,11 @@ class KNNAlgorithm(BaseAlgorithm):
             bandwidth=self.bandwidth,
             search=self.search,
             initial_value=self.initial_value,
-            bounds_from_space=not normalizes,
+            bounds_from_space=not self._normalized,
             **self._policy_arguments(),
             **self.policy_kwargs,
         ).to(self.device)
+        self._warn_of_overshooting()
         self._rule = rule = self._make_rule()
         self._stream = RandomStream((self.n_envs, 2, rule.n_uniforms))
         self._prediction_stream = RandomStream((rule.n_uniforms,), purpose=1)
@@ -232,15 +281,17 @@ class KNNAlgorithm(BaseAlgorithm):
         assert isinstance(table, DenseTable)
         return TorchLearner(perceiver, table, rule, self._stream, self.n_envs, form, one_step=self.trace_decay == 0.0)
 
+    def _setup_lr_schedule(self) -> None:
+        self.lr_schedule = make_schedule(self.learning_rate)
+
     def _check_parameters(self) -> None:
-        self.learning_rate = check_schedule("learning_rate", self.learning_rate, 0.0)
+        self.learning_rate = check_rate("learning_rate", self.learning_rate, 0.0)  # type: ignore[assignment]
         self.gamma = check_number("gamma", self.gamma, 0.0, 1.0)
-        self.trace_decay = check_schedule("trace_decay", self.trace_decay, 0.0, 1.0)
+        self.trace_decay = check_rate("trace_decay", self.trace_decay, 0.0, 1.0)
         check_word("step_size", self.step_size, ["paper", "normalized"])
         check_word("traces", self.traces, ["replacing", "accumulating"])
         check_word("tie_break", self.tie_break, ["random", "first"])
-        if not isinstance(self.reset_other_actions, (bool, np.bool_)):
-            raise ValueError(f"reset_other_actions must be True or False; got {self.reset_other_actions!r}")
+        check_flag("reset_other_actions", self.reset_other_actions)
 
     def _make_epsilon_schedule(self) -> Schedule:
         initial = check_number("exploration_initial_eps", self.exploration_initial_eps, 0.0, 1.0)
@@ -248,13 +299,54 @@ class KNNAlgorithm(BaseAlgorithm):
         fraction = check_number("exploration_fraction", self.exploration_fraction, 0.0, 1.0, above=True)
         return LinearSchedule(initial, final, fraction)
 
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Set the environment to learn from.
+
+        :param env: one of the same spaces, and as many if it is a VecEnv
+        :param force_reset: whether ``learn`` starts new episodes
+        :raises ValueError: if its observations are normalised (VecNormalize) and those that the model was made for are
+            not, or the other way round; as in SB3, if its spaces differ
+        """
+        self._check_normalization(env)
+        super().set_env(env, force_reset)
+
+    def _check_normalization(self, env: GymEnv | None) -> None:
+        normalized = normalizes_observations(env)
+        if normalized and not self._normalized:
+            raise ValueError(
+                "env normalises observations (VecNormalize), and the points of this model were laid for observations "
+                f"as they are. Make a model with it, {type(self).__name__}(VecNormalize(env)), or leave observations "
+                "as they are, VecNormalize(env, norm_obs=False)"
+            )
+        if self._normalized and not normalized:
+            raise ValueError(
+                "the points of this model were laid for normalised observations (VecNormalize), and env does not "
+                "normalise them. Wrap it with what was known of them: VecNormalize.load(path, env)"
+            )
+
+    def _warn_of_overshooting(self) -> None:
+        """Of step sizes that carry a value beyond what it is moved towards."""
+        highest = max(self.lr_schedule(progress) for progress in PROGRESS)
+        # An update removes the share α of the TD error if it is normalised, otherwise α Σp², which is α/k at least.
+        most = 1 if self.step_size == "normalized" else self.policy.n_neighbors
+        if highest > most:
+            warnings.warn(
+                f"learning_rate={highest:g} with step_size={self.step_size!r} moves values beyond what they are "
+                f"learned from, and they may diverge: give at most {most}",
+                stacklevel=4,
+            )
+
     def set_random_seed(self, seed: int | None = None) -> None:
         """
         Seed Python, NumPy, torch, the environment, the action space, and the learner's own numbers.
 
-        :param seed: the seed; ``None`` leaves all but the learner's own as they are, which start anew from the
-            operating system's entropy
+        :param seed: the seed, from 0 to 2³² - 1; ``None`` leaves all but the learner's own as they are, which start
+            anew from the operating system's entropy
+        :raises ValueError: if it is no such number
         """
+        if seed is not None:
+            seed = check_integer("seed", seed, 0, LARGEST_SEED)
         super().set_random_seed(seed)
         self._stream.seed(seed)
         self._prediction_stream.seed(seed)
@@ -311,9 +403,11 @@ class KNNAlgorithm(BaseAlgorithm):
         :param reset_num_timesteps: whether to count steps from 0; if not, training goes on where it was
         :param progress_bar: whether to show a progress bar (tqdm and rich)
         :return: the model
-        :raises ValueError: if an environment returns an observation or reward that is not finite. The table is
-            untouched by that step
+        :raises ValueError: if ``total_timesteps`` is no number, or an environment returns an observation or reward that
+            is not finite. The table is untouched by that step
         """
+        # As SB3, which takes 1e6 as well, and does nothing for numbers below 1; but NaN would be no steps, unnoticed.
+        check_number("total_timesteps", total_timesteps)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -324,6 +418,7 @@ class KNNAlgorithm(BaseAlgorithm):
             if not self._step(audience, log_interval):
                 break
         audience.catch_up(self.num_timesteps)
+        self.policy.set_training_mode(False)
         callback.on_training_end()
         return self
 
@@ -343,6 +438,13 @@ class KNNAlgorithm(BaseAlgorithm):
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        if self.learner.table is not self.policy.table:
+            raise ValueError(
+                "model.policy has been replaced, and what is learned would go to the one that the model was made with. "
+                "Leave that one, and have it take over what the other has learned: "
+                "model.policy.load_state_dict(other.state_dict()), with the points, bounds and dtype of the other"
+            )
+        self._standing = self._last_obs  # type: ignore[assignment]
         if total_timesteps > self.num_timesteps:
             self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
         return total_timesteps, callback
@@ -359,6 +461,12 @@ class KNNAlgorithm(BaseAlgorithm):
         assert env is not None
         for listener in audience.listeners:
             listener.on_rollout_start()
+        last_obs = self._last_obs
+        if last_obs is not self._standing:
+            # A callback has moved the environments, or has given others, which need a reset if it did not say where.
+            self._last_actions = None
+            if last_obs is None:
+                self._last_obs = last_obs = env.reset()  # type: ignore[assignment]
         actions = self._last_actions
         if actions is None or self._measuring:
             actions = self._random_actions() if self._measuring else self._first_actions()
@@ -386,26 +494,46 @@ class KNNAlgorithm(BaseAlgorithm):
             # What was going on in the environments is lost with this step: to go on is to begin anew.
             self._last_obs = self._last_actions = None
             raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
-        self._last_obs = new_obs  # type: ignore[assignment]
+        self._standing = new_obs  # type: ignore[assignment]
         n_logs = 0
-        if any_ended:
+        reported = any_ended
+        for info in infos:
+            if "episode" in info:
+                reported = True
+        if reported:
             self._update_info_buffer(infos, dones)
+        if any_ended:
             before = self._episode_num
             self._episode_num += ended.count(True)
             n_logs = self._episode_num // log_interval - before // log_interval if log_interval else 0
 
-        if self._adapts and not (self._measuring or self.policy.perceiver.sees(self._last_obs)):  # type: ignore[arg-type]
-            self._widen()
+        if self._adapts and not (self._measuring or self.policy.perceiver.sees(new_obs)):  # type: ignore[arg-type]
+            self._widen(new_obs)  # type: ignore[arg-type]
 
         # What is seen is handed on and not copied: SB3's algorithms hold on to what a VecEnv returned as well.
-        told = audience.members and audience.hears(new_obs, any_ended)  # type: ignore[arg-type]
-        if told and not audience.tell(locals(), self.num_timesteps):
-            return False
+        if audience.members and audience.hears(new_obs, any_ended):  # type: ignore[arg-type]
+            self._acted_on = last_obs  # type: ignore[assignment]
+            try:
+                go_on = audience.tell(locals(), self.num_timesteps)
+            finally:
+                self._move_on()
+                self._acted_on = None
+            if not go_on:
+                return False
+        else:
+            self._last_obs = new_obs  # type: ignore[assignment]
         if n_logs:
             self.dump_logs()
         for listener in audience.listeners:
             listener.on_rollout_end()
         return True
+
+    def _move_on(self) -> None:
+        """Be where the step led, or where a callback that was told of it says: episodes begin there."""
+        if self._last_obs is self._acted_on:
+            self._last_obs = self._standing
+        else:
+            self._last_actions = None
 
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
@@ -456,9 +584,9 @@ class KNNAlgorithm(BaseAlgorithm):
         if not self._measuring:
             self._tell_range(f"measured over {self._n_measured} random steps")
 
-    def _widen(self) -> None:
+    def _widen(self, observations: np.ndarray) -> None:
         """Take in the last observations, and begin anew from there."""
-        self.policy.widen(th.from_numpy(self._last_obs).to(self.device))
+        self.policy.widen(th.from_numpy(observations).to(self.device))
         self._last_actions = None
         self._tell_range(f"widened at step {self.num_timesteps}")
 
@@ -498,7 +626,8 @@ class KNNAlgorithm(BaseAlgorithm):
     # ------------------------------------------------------ saving and loading
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rule", "_stream", "_prediction_stream"]
+        ours = ["_rule", "_stream", "_prediction_stream", "_standing", "_acted_on"]
+        return [*super()._excluded_save_params(), *ours]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "learner"], []
@@ -518,15 +647,32 @@ class KNNAlgorithm(BaseAlgorithm):
         :param include: attributes to save although SB3 leaves them out
         """
         self._stream_states = [self._stream.state(), self._prediction_stream.state()]
-        if not isinstance(path, (str, pathlib.Path)):
-            super().save(path, exclude, include)
-            return
-        target = pathlib.Path(path)
-        if not target.suffix:
-            target = target.with_name(f"{target.name}.zip")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as file:
+        shown = self._last_obs, self._last_actions
+        if self._acted_on is not None:
+            # A callback saves: its file goes on where the next step does.
+            self._move_on()
+        try:
+            if not isinstance(path, (str, pathlib.Path)):
+                self._save(path, exclude, include)
+                return
+            target = pathlib.Path(path)
+            if not target.suffix:
+                target = target.with_name(f"{target.name}.zip")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(target) as file:
+                self._save(file, exclude, include)
+        finally:
+            self._last_obs, self._last_actions = shown
+
+    def _save(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
+        """Save to an open file, and beside what SB3 pickles there the same as data, for :meth:`load` without trust."""
+        left_out = {*self._excluded_save_params(), *(exclude or ())} - set(include or ())
+        values = {name: value for name, value in vars(self).items() if name not in left_out}
+        self.plain = encodable({name: value for name, value in values.items() if not is_json_serializable(value)})
+        try:
             super().save(file, exclude, include)
+        finally:
+            del self.plain
 
     @classmethod
     def load(
@@ -537,10 +683,15 @@ class KNNAlgorithm(BaseAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        trusted: bool = True,
         **kwargs: Any,
     ) -> SelfKNNAlgorithm:
         """
         Load a model from a zip file.
+
+        SB3's format has pickled objects in it, and to read them is to run what the file says: by default a file is
+        trusted as a program is. With ``trusted=False`` nothing is unpickled; spaces, schedules of SB3, arrays and
+        numbers are read as data, which :meth:`save` has stored beside.
 
         :param path: file, or file-like object
         :param env: environment to go on with; ``None`` to predict only. Its number may differ from the saved
@@ -549,19 +700,35 @@ class KNNAlgorithm(BaseAlgorithm):
         :param print_system_info: whether to print the system it was saved on
         :param force_reset: whether ``learn`` starts new episodes; ``False`` goes on in the middle of the saved
             ones, for an environment that is in the state it was in
+        :param trusted: whether to unpickle what the file holds; ``False`` for files of others
         :param kwargs: attributes to change; with ``seed`` the random numbers begin anew
         :return: the model
-        :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has
+        :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has; without
+            trust also if it holds functions or other objects that are there only as pickles
         """
         saved = read_description(path)
-        if saved.get("algorithm") != cls.__name__:
+        if saved.get("algorithm") != cls._algorithm:
             raise ValueError(
-                f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls.__name__}: "
+                f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls._algorithm}: "
                 "load it with its own class"
             )
-        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if not trusted:
+            custom_objects = objects_for(path, saved, custom_objects or {}) | (custom_objects or {})
+        try:
+            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (RuntimeError, pickle.UnpicklingError, KeyError) as error:  # of a state that does not fit
+            # SB3 takes a ValueError for that of an old file of DQN, and looks in vain for an optimizer.
+            cause = error.__context__ if isinstance(error, KeyError) and error.__context__ else error
+            raise ValueError(f"{path}: {cause}") from cause
+        vars(model).pop("plain", None)
+        if env is not None:
+            model._check_normalization(model.env)
         if model.n_envs != saved["n_envs"]:
             model._last_obs = None
+        elif model._last_obs is not None:
+            shape = (model.n_envs, *(model.observation_space.shape or ()))
+            if getattr(model._last_obs, "shape", None) != shape:
+                raise ValueError(f"{path}: the last observations must have shape {shape}; got {model._last_obs!r:.200}")
         if not model.learner.in_episodes:
             model._last_actions = None
         # A seed that is given begins new sequences; without one the saved ones go on.
@@ -569,6 +736,34 @@ class KNNAlgorithm(BaseAlgorithm):
             for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
                 stream.set_state(state)
         return model
+
+
+def normalizes_observations(env: GymEnv | None) -> bool:
+    """
+    :param env: an environment, VecEnv or not
+    :return: whether it is in a VecNormalize that changes observations
+    """
+    normalizer = unwrap_vec_normalize(env)  # type: ignore[arg-type]
+    return normalizer is not None and normalizer.norm_obs
+
+
+def check_device(device: Any) -> th.device:
+    """
+    :param device: what was given
+    :return: the device it means; the CPU for CUDA where there is none, as in SB3
+    :raises ValueError: if there is no such device, or it cannot hold a table
+    """
+    error: Exception | None = None
+    if isinstance(device, (str, th.device)):
+        try:
+            found = get_device(device)
+            # Some devices hold no float64, and some nothing at all.
+            th.zeros(1, dtype=th.float64, device=found).item()
+        except (AssertionError, RuntimeError, TypeError, ValueError) as raised:
+            error = raised
+        else:
+            return found
+    raise ValueError(f"device must be 'cpu', 'cuda', 'auto' or another of torch's; got {shown(device)}") from error
 
 
 def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import argparse
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from sb3_knntd.zoo import SCRIPTS
 from sb3_knntd.zoo import run as run_script
 
 if TYPE_CHECKING:
+    import gymnasium as gym
+
     # argparse's own class is generic only in type stubs.
     Subparsers = argparse._SubParsersAction["Parser"]
     AddCommand = Callable[[Subparsers], None]
@@ -36,6 +39,32 @@ class Parser(argparse.ArgumentParser):
         :raises SystemExit: with code 2, always
         """
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())}\n")
+
+
+def reason_of(error: Exception) -> str:
+    """
+    :param error: what was raised
+    :return: what it says; with its type, unless it was written for users to read
+    """
+    from gymnasium.error import Error
+
+    text = str(error)
+    is_plain = isinstance(error, (ValueError, OSError, ImportError, AssertionError, Error))
+    return text if is_plain and text else f"{type(error).__name__}: {text}"
+
+
+def make_env(env_id: str) -> gym.Env[Any, Any]:
+    """
+    :param env_id: gymnasium id
+    :return: the environment
+    :raises CommandError: if it cannot be made, whatever it raises
+    """
+    import gymnasium as gym
+
+    try:
+        return gym.make(env_id)
+    except Exception as error:
+        raise CommandError(f"--env: {env_id!r} cannot be made: {reason_of(error)}") from error
 
 
 def positive_int(text: str) -> int:
@@ -127,8 +156,8 @@ def _add_demo(subparsers: Subparsers) -> None:
     parser = subparsers.add_parser(
         "demo",
         help="train on an environment and show what was learned",
-        description="Train KNNTD on an environment, save and reload the model, evaluate it beside a random policy, "
-        "and draw its learning curve and value function.",
+        description="Train KNNTD, or ExA where actions are continuous, on an environment, save and reload the model, "
+        "evaluate it beside a random policy, and draw its learning curve and value function.",
     )
     parser.add_argument("--env", default="MountainCar-v0", metavar="ID", help="gymnasium id (default: %(default)s)")
     parser.add_argument(
@@ -320,8 +349,23 @@ def add_zoo(subparsers: Subparsers) -> None:
 
 def _run_zoo(args: argparse.Namespace) -> int:
     require("rl_zoo3", *SCRIPTS[args.command].needs, extra="zoo")
-    run_script(args.command, args.arguments)
+    try:
+        run_script(args.command, args.arguments)
+    except FloatingPointError as error:
+        # Action values that diverge; the message says what to change.
+        raise CommandError(str(error)) from error
+    except Exception as error:
+        if _is_at_work(error):
+            raise
+        # RL Zoo checks few of its arguments: what they lead to, until there is something to train, is its answer.
+        raise CommandError(reason_of(error)) from error
     return 0
+
+
+def _is_at_work(error: Exception) -> bool:
+    """Whether it was raised when learning had begun, or an environment was stepped: no matter of arguments."""
+    names = {frame.name for frame in traceback.extract_tb(error.__traceback__)}
+    return ("learn" in names and "_setup_learn" not in names) or not names.isdisjoint({"step", "predict"})
 
 
 #: Each adds one command or several: the parser, and with ``set_defaults(run=...)`` the function that runs it and
@@ -339,6 +383,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "sb3-knntd", commands: S
     """
     parser = Parser(prog=prog, description="kNN-TD(λ) for Stable-Baselines3: a table at k nearest points, no network.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('sb3-knntd')}")
+    parser.add_argument("--traceback", action="store_true", help="show where an error came from, not its reason alone")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
     for add_command in commands:
         add_command(subparsers)
@@ -346,6 +391,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "sb3-knntd", commands: S
     try:
         exit_code: int = args.run(args)
     except CommandError as error:
+        if args.traceback:
+            raise
         subparsers.choices[args.command].error(str(error))
     except KeyboardInterrupt:
         print("\nInterrupted.", file=sys.stderr)

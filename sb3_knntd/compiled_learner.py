@@ -49,6 +49,7 @@ class CompiledLearner(Learner):
         self._probabilities = np.zeros((3, n_envs, k))
         n_blocks = len(rule.blocks) - 1
         self._entries = np.zeros((3, n_envs, k, n_blocks), np.int64)
+        self.shape = n_envs, k, n_blocks
         self._held = np.full((n_envs, n_blocks), kernel.UNDRAWN)
         self._lengths = np.zeros(1 + n_envs)
         actions = np.zeros((3, n_envs, self._rule[-1].shape[1]))
@@ -160,16 +161,17 @@ class CompiledLearner(Learner):
             "traces": self.live.state(),
         }
 
-    def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
+    def _forget(self) -> None:
         self.live.forget()
-        self.in_episodes = state_dict["entries"].shape == self._entries[kernel.NOW].shape
-        if self.in_episodes:
-            self._indices[kernel.NOW] = state_dict["indices"].numpy()
-            self._probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
-            self._entries[kernel.NOW] = state_dict["entries"].numpy()
-            self._held[:] = state_dict["held"].numpy()
-            self._lengths[:] = state_dict["lengths"].numpy()
-            self.live.set_state(state_dict["traces"])
+        self._set_desk()
+
+    def _take_over(self, state_dict: dict[str, Any]) -> None:
+        self._indices[kernel.NOW] = state_dict["indices"].numpy()
+        self._probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
+        self._entries[kernel.NOW] = state_dict["entries"].numpy()
+        self._held[:] = state_dict["held"].numpy()
+        self._lengths[:] = state_dict["lengths"].numpy()
+        self.live.set_state(state_dict["traces"])
         self._set_desk()
 
     def _take_in(self, truncated: Mapping[int, np.ndarray]) -> None:

@@ -8,9 +8,8 @@ import signal
 import time
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
@@ -19,9 +18,14 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_knntd.cli import CommandError
+from sb3_knntd.cli import CommandError, make_env
+from sb3_knntd.exa import ExA
+from sb3_knntd.files import replacing
 from sb3_knntd.knntd import KNNTD
 from sb3_knntd.plots import figure_of, plot_learning_curve, plot_value_function, telling_dims
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EVAL_EPISODES = 100
 #: Predicting for several environments at once takes hardly longer than for one.
@@ -87,37 +91,36 @@ class StopOnInterrupt:
 
 def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
     """
-    Train KNNTD, save it, load it, evaluate it beside a random policy, draw pictures, and tell on standard output.
+    Train KNNTD, or ExA where actions are continuous, save it, load it, evaluate it beside a random policy, draw
+    pictures, and tell on standard output.
 
     :param env_id: gymnasium id
     :param steps: number of environment steps to train for
     :param seed: seed of training; evaluation derives its own from it
     :param out: folder that all files are written to
     :return: whether it came to its end; after Ctrl-C during training the model is saved, and no more
-    :raises CommandError: if there is no such environment, KNNTD does not take its spaces, or ``out`` is no
+    :raises CommandError: if there is no such environment, neither algorithm takes its spaces, or ``out`` is no
         folder that can be written to
     """
-    try:
-        env = gym.make(env_id)
-    # ModuleNotFoundError is of ids with a module to import, such as "package:Env-v0".
-    except (gym.error.Error, ModuleNotFoundError) as error:
-        raise CommandError(f"cannot make the environment {env_id!r}: {error}") from error
+    env = make_env(env_id)
+    algorithm: type[KNNTD | ExA] = ExA if isinstance(env.action_space, spaces.Box) else KNNTD
+    name = algorithm.__name__
     try:
         # Before the first file is written: an environment that is refused must not cost an earlier demo's files.
-        KNNTD(env)
+        algorithm(env)
     except ValueError as error:
         raise CommandError(str(error)) from error
     # Named after the environment, so that demos of several can share a folder.
-    stem = f"knntd_{re.sub(r'[^A-Za-z0-9._-]', '_', env_id)}"
+    stem = f"{name.lower()}_{re.sub(r'[^A-Za-z0-9._-]', '_', env_id)}"
     files = {"model": out / f"{stem}.zip", "episodes": out / f"{stem}.monitor.csv"}
     try:
         out.mkdir(parents=True, exist_ok=True)
         monitored = Monitor(env, str(files["episodes"]))
     except OSError as error:
         raise CommandError(f"cannot write to {out}: {error}") from error
-    model = KNNTD(monitored, seed=seed, tensorboard_log=str(out / "tensorboard"))
+    model = algorithm(monitored, seed=seed, tensorboard_log=str(out / "tensorboard"))
 
-    print(f"Training KNNTD on {env_id} for {steps:,} steps")
+    print(f"Training {name} on {env_id} for {steps:,} steps")
     start = time.perf_counter()
     with StopOnInterrupt() as stop:
         model.learn(steps, callback=stop, progress_bar=True)
@@ -138,12 +141,12 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
         seed=seed + EVAL_SEED_OFFSET,
         env_kwargs={} if step_limit is None else {"max_episode_steps": step_limit},
     )
-    loaded = KNNTD.load(files["model"], env=eval_env)
+    loaded = algorithm.load(files["model"], env=eval_env)
     learned = _evaluate(loaded, eval_env)
     random = _evaluate(RandomPolicy(eval_env.action_space, seed), eval_env)
     eval_env.close()
     print()
-    _print_returns(f"Return on {env_id}", {"KNNTD": learned, "random policy": random})
+    _print_returns(f"Return on {env_id}", {name: learned, "random policy": random})
     if step_limit is not None:
         print(f"The environment sets no limit to an episode: these were cut at {step_limit:,} steps.")
 
@@ -152,11 +155,11 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
         np.cumsum(monitored.get_episode_lengths()), monitored.get_episode_rewards(), baseline=float(random.mean())
     )
     axes.set_xlim(right=steps)
-    figure_of(axes).suptitle(f"KNNTD on {env_id}")
-    figure_of(axes).savefig(files["learning curve"])
+    figure_of(axes).suptitle(f"{name} on {env_id}")
+    _save_picture(figure_of(axes), files["learning curve"])
     if isinstance(loaded.observation_space, spaces.Box) and loaded.observation_space.shape[0] >= 2:
         files["value function"] = out / f"{stem}_value_function.png"
-        figure_of(plot_value_function(loaded, telling_dims(loaded))[0]).savefig(files["value function"])
+        _save_picture(figure_of(plot_value_function(loaded, telling_dims(loaded))[0]), files["value function"])
     print()
     _print_files(files)
     print(f"See the log with: tensorboard --logdir {shlex.quote(str(out / 'tensorboard'))}")
@@ -166,6 +169,11 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
 def _evaluate(policy: PolicyPredictor, env: VecEnv) -> np.ndarray:
     returns, _ = evaluate_policy(policy, env, EVAL_EPISODES, deterministic=True, return_episode_rewards=True)
     return np.asarray(returns)
+
+
+def _save_picture(figure: Figure, path: Path) -> None:
+    with replacing(path) as file:
+        figure.savefig(file, format="png")
 
 
 def _print_returns(title: str, returns: dict[str, np.ndarray]) -> None:

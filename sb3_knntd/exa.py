@@ -10,16 +10,17 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_number, check_word
+from sb3_knntd.checks import check_number, check_word, shown
 from sb3_knntd.policies import ExAPolicy
 from sb3_knntd.rules import ActionRule, ContinuousRule
 
 #: ``exploration_hold="auto"``: what share of an episode. A pole falls within fifty steps if something is tried for
 #: longer, and a car leaves no valley on less.
 AUTO_HOLD = 1 / 50
+#: For how many steps a draw can be held: the random numbers that end it are multiples of 2^-53.
+LONGEST_HOLD = 1e15
 
 SelfExA = TypeVar("SelfExA", bound="ExA")
 
@@ -52,13 +53,14 @@ class ExA(KNNAlgorithm):
     :param exploration_initial_eps: ε at the start, in [0, 1]: with ``"shared"`` the share of the time spent exploring
     :param exploration_final_eps: ε at the end, in [0, 1]
     :param exploration_fraction: share of the training over which ε changes, in (0, 1]
-    :param exploration_hold: for how many steps in the mean, >= 1, a shared draw of whether and what to explore is
-        held; ``"auto"`` is a fiftieth of an episode, as long as episodes are at present
+    :param exploration_hold: for how many steps in the mean, in [1, 1e15], a shared draw of whether and what to explore
+        is held; ``"auto"`` is a fiftieth of an episode, as long as episodes are at present
     :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
     """
 
     policy: ExAPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": ExAPolicy}
+    _algorithm: ClassVar[str] = "ExA"
     _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Box
     _action_space_advice: ClassVar[str] = "For Discrete actions use KNNTD"
 
@@ -66,9 +68,9 @@ class ExA(KNNAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "KNNPolicy",
         env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = LinearSchedule(0.7, 0.05, 1.0),  # noqa: B008
+        learning_rate: float | Schedule | str = "lin_0.7_0.05",
         gamma: float = 0.99,
-        trace_decay: float | Schedule = 0.9,
+        trace_decay: float | Schedule | str = 0.9,
         n_neighbors: int | str = "auto",
         points: Any = "auto",
         bounds: Any = None,
@@ -159,10 +161,11 @@ class ExA(KNNAlgorithm):
     def _hold(self) -> tuple[float, float]:
         """For how many steps a draw is held at least, and for what share of an episode."""
         if not isinstance(self.exploration_hold, str):
-            return check_number("exploration_hold", self.exploration_hold, 1.0), 0.0
+            return check_number("exploration_hold", self.exploration_hold, 1.0, LONGEST_HOLD), 0.0
         if self.exploration_hold != "auto":
             raise ValueError(
-                f"exploration_hold must be a finite number in [1, inf), or 'auto'; got {self.exploration_hold!r}"
+                f"exploration_hold must be a finite number in [1, {LONGEST_HOLD:g}], or 'auto'; got "
+                f"{shown(self.exploration_hold)}"
             )
         return 1.0, AUTO_HOLD
 

@@ -9,13 +9,13 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_schedule, check_word
+from sb3_knntd.checks import LEAST, check_word
 from sb3_knntd.exploration import EXPLORATIONS
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.rules import ActionRule, DiscreteRule
+from sb3_knntd.schedules import check_rate, make_schedule
 
 SelfKNNTD = TypeVar("SelfKNNTD", bound="KNNTD")
 
@@ -27,8 +27,8 @@ class KNNTD(KNNAlgorithm):
 
     Paper: Martin H., de Lope, Maravall, "Robust high performance reinforcement learning through weighted k-nearest
     neighbors", Neurocomputing 74 (2011), https://doi.org/10.1016/j.neucom.2010.07.027. With ``trace_decay=0`` it is
-    kNN-TD (Algorithm 2), with ``n_neighbors=1`` besides NN-TD (Algorithm 1). On Discrete and MultiDiscrete
-    observations it is exact tabular SARSA(λ) or Q(λ).
+    kNN-TD (Algorithm 2), with ``n_neighbors=1`` besides NN-TD (Algorithm 1). On Discrete, MultiDiscrete
+    and MultiBinary observations it is exact tabular SARSA(λ) or Q(λ).
 
     .. code-block:: python
 
@@ -38,22 +38,22 @@ class KNNTD(KNNAlgorithm):
     :param policy: the environment, as there is no policy to choose; or, in SB3's order, ``"KNNPolicy"`` or a subclass
         of :class:`~sb3_knntd.KNNPolicy`
     :param env: the environment: a gymnasium id, an environment, or a VecEnv
-    :param learning_rate: α >= 0, or a function of the remaining progress (from 1 to 0); by default it falls linearly
-        from 0.5 to 0.05
+    :param learning_rate: α >= 0; or a function of the remaining progress (from 1 to 0); or a word for one that changes
+        linearly over the whole training: ``"lin_0.5_0.05"`` falls from 0.5 to 0.05, ``"lin_0.5"`` to 0
     :param gamma: γ, in [0, 1]
-    :param trace_decay: λ, in [0, 1], or a function of the remaining progress
+    :param trace_decay: λ, in [0, 1], or a function or word as for ``learning_rate``
     :param n_neighbors: k >= 1; ``"auto"`` is 2 obs_dim + 1, a point and its neighbours along each axis, and 1 on
-        Discrete and MultiDiscrete observations
+        Discrete, MultiDiscrete and MultiBinary observations
     :param points: the perception points: an int or one int a dimension for a lattice over the bounds, or an array
         (n_points, obs_dim) in observation units for scattered points; ``"auto"`` is a lattice of about 8000 points,
-        at most 20 in a dimension, or one point a state on Discrete and MultiDiscrete observations
+        at most 20 in a dimension, or one point a state on Discrete, MultiDiscrete and MultiBinary ones
     :param bounds: the range mapped to [-1, 1]: (low, high), arrays (obs_dim,) in observation units; ``None`` takes the
         space's, and finds a range for every dimension that has none in a random phase at the start of :meth:`learn`;
         ``"adaptive"`` finds one for every dimension there, and widens it whenever an observation lies beyond, carrying
         the values over to where a lattice's points then are and letting go the traces
     :param weights: ``"inverse_quadratic"``: 1 / (1 + d²/h²), eq. 5; ``"gaussian"``: exp(-d²/2h²); or a function from
         squared distances (batch, k), scaled units, to weights (batch, k), both torch tensors
-    :param bandwidth: h of the weights, > 0, scaled units (the bounds are 2 wide)
+    :param bandwidth: h of the weights, >= 1e-100, scaled units (the bounds are 2 wide)
     :param search: how neighbours are found, all exactly but ``"hnsw"``: ``"brute"``, ``"lattice"``, ``"kd_tree"``,
         ``"hnsw"`` (approximate, extra ``[ann]``), or ``"auto"``
     :param step_size: ``"paper"`` for α as in eq. 13, ``"normalized"`` for α / Σp², which makes α the share of the TD
@@ -67,21 +67,22 @@ class KNNTD(KNNAlgorithm):
     :param exploration_initial_eps: ε at the start, in [0, 1]
     :param exploration_final_eps: ε at the end, in [0, 1]
     :param exploration_fraction: share of the training over which ε changes, in (0, 1]
-    :param temperature: of softmax, > 0, in units of return, or a function of the remaining progress
+    :param temperature: of softmax, >= 1e-100, in units of return, or a function or word as for ``learning_rate``
     :param tie_break: which of several equal best actions is taken while training: ``"random"`` or ``"first"``
-    :param initial_value: Q at the start; above what is attainable it makes the learner explore
-    :param stats_window_size: number of episodes that the logged means are over
+    :param initial_value: Q at the start, up to ±1e30; above what is attainable it makes the learner explore
+    :param stats_window_size: number >= 1 of episodes that the logged means are over
     :param tensorboard_log: folder for TensorBoard, ``None`` for no log
     :param policy_kwargs: ``dtype`` (``torch.float64`` or ``torch.float32``), ``table`` (``"auto"``, ``"dense"``,
         ``"hashed"``) and ``compiled`` (``False`` for the torch reference), see :class:`~sb3_knntd.KNNPolicy`
     :param verbose: 0 for no output, 1 for information, 2 for debugging
-    :param seed: seed of all random numbers
+    :param seed: seed of all random numbers, from 0 to 2³² - 1
     :param device: where perception and table are; on the CPU the step is compiled
     :param _init_setup_model: whether to build the table at once
     :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": KNNPolicy}
+    _algorithm: ClassVar[str] = "KNNTD"
     _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
     _action_space_advice: ClassVar[str] = (
         "For a Box of actions use ExA; MultiDiscrete and MultiBinary can be numbered into one Discrete space by "
@@ -92,9 +93,9 @@ class KNNTD(KNNAlgorithm):
         self,
         policy: str | type[BasePolicy] | GymEnv = "KNNPolicy",
         env: GymEnv | str | None = None,
-        learning_rate: float | Schedule = LinearSchedule(0.5, 0.05, 1.0),  # noqa: B008
+        learning_rate: float | Schedule | str = "lin_0.5_0.05",
         gamma: float = 0.99,
-        trace_decay: float | Schedule = 0.9,
+        trace_decay: float | Schedule | str = 0.9,
         n_neighbors: int | str = "auto",
         points: Any = "auto",
         bounds: Any = None,
@@ -109,7 +110,7 @@ class KNNTD(KNNAlgorithm):
         exploration_initial_eps: float = 0.3,
         exploration_final_eps: float = 0.0,
         exploration_fraction: float = 0.5,
-        temperature: float | Schedule = 1.0,
+        temperature: float | Schedule | str = 1.0,
         tie_break: str = "random",
         initial_value: float = 0.0,
         stats_window_size: int = 100,
@@ -162,8 +163,8 @@ class KNNTD(KNNAlgorithm):
     def _make_exploration_schedule(self) -> Schedule:
         check_word("exploration", self.exploration, EXPLORATIONS)
         epsilon = self._make_epsilon_schedule()
-        self.temperature = check_schedule("temperature", self.temperature, 0.0, above=True)
-        return FloatSchedule(self.temperature) if self.exploration == "softmax" else epsilon
+        self.temperature = check_rate("temperature", self.temperature, LEAST)
+        return make_schedule(self.temperature) if self.exploration == "softmax" else epsilon
 
     def learn(
         self: SelfKNNTD,

@@ -9,12 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_knntd.kernels.memory import LEAST_CLOCK
 from sb3_knntd.kernels.step import UNDRAWN, count_steps
-from sb3_knntd.memory import DenseTable, DenseTraces, OneStepTraces, Traces
+from sb3_knntd.memory import DenseTable, DenseTraces, LiveStore, OneStepTraces, QTable, Traces
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.random_stream import RandomStream
 from sb3_knntd.rules import ActionRule, Choice
+from sb3_knntd.states import checked_integer, checked_points, checked_tensor, entry
 
+#: By how much a saved share may exceed 1, or a sum of probabilities differ from it.
+ROUNDING = 1e-3
 #: The scheduled parameters at one step: α, λ, and ε or the temperature.
 Rates = tuple[float, float, float]
 
@@ -42,6 +46,10 @@ class Learner(ABC):
     """
 
     n_envs: int
+    perceiver: Perceiver
+    table: QTable
+    #: number of environments, neighbours, and blocks of columns
+    shape: tuple[int, int, int]
     #: whether it holds where the episodes are
     in_episodes = False
 
@@ -100,7 +108,6 @@ class Learner(ABC):
         :return: tensors and numbers; the same keys for every learner
         """
 
-    @abstractmethod
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
         """
         Take over the state of a learner of the same table. One of another number of environments or neighbours
@@ -108,7 +115,50 @@ class Learner(ABC):
 
         :param state_dict: what :meth:`state_dict` returned
         :param strict: part of torch's signature; a state is always taken whole
+        :raises ValueError: if no learner can have returned it; the message says why
         """
+        in_episodes = getattr(entry(state_dict, "entries"), "shape", None) == self.shape
+        if in_episodes:
+            self._check_state(state_dict)
+            # One that has not begun yet.
+            in_episodes = bool(state_dict["probabilities"].any())
+        self._forget()
+        self.in_episodes = in_episodes
+        if in_episodes:
+            self._take_over(state_dict)
+
+    @abstractmethod
+    def _forget(self) -> None:
+        """Let go where the episodes are."""
+
+    @abstractmethod
+    def _take_over(self, state_dict: dict[str, Any]) -> None:
+        """Take over a state that fits."""
+
+    def _check_state(self, state: dict[str, Any]) -> None:
+        n_envs, k, n_blocks = self.shape
+        n_points, n_actions = self.perceiver.points.n_points, self.table.n_actions
+        checked_tensor(state, "indices", (n_envs, k), th.int64, 0, n_points - 1)
+        probabilities = checked_tensor(state, "probabilities", (n_envs, k), th.float64, 0.0, 1.0 + ROUNDING)
+        if probabilities.any() and not ((probabilities.sum(dim=1) - 1.0).abs() <= ROUNDING).all():
+            raise ValueError(f"probabilities must sum to 1 in every row; got {probabilities.sum(dim=1).tolist()}")
+        checked_tensor(state, "entries", (n_envs, k, n_blocks), th.int64, 0, n_actions - 1)
+        checked_tensor(state, "held", (n_envs, n_blocks), th.int64, UNDRAWN, n_actions - 1)
+        checked_tensor(state, "lengths", (1 + n_envs,), th.float64, 0.0)
+        traces, rows = entry(state, "traces"), self.table.points()
+        live = checked_points(traces, "points", n_points)
+        if rows is not None and not th.isin(live, rows).all():
+            raise ValueError("points must be those that the table has rows for; some have a trace and no row")
+        n = len(live)
+        checked_tensor(traces, "traces", (n, n_actions, n_envs), th.float64, 0.0)
+        checked_tensor(traces, "share", (n, n_actions), th.float64, 0.0, 1.0 + ROUNDING)
+        checked_tensor(traces, "base", (n, n_actions), th.float64)
+        pace = checked_tensor(traces, "pace", (1 + n_envs,), th.float64)
+        if not LEAST_CLOCK <= pace[0] <= 1.0:
+            raise ValueError(f"pace must begin with a number within [{LEAST_CLOCK:g}, 1]; got {pace[0]:g}")
+        # A store has grown to no more than this, see LiveStore.reserve.
+        most = 4 * (n_points if rows is None else len(rows)) + 2 * n_envs * k
+        checked_integer(traces, "capacity", n, max(most, LiveStore.SMALLEST))
 
 
 def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
@@ -154,6 +204,8 @@ class TorchLearner(Learner):
     :param one_step: whether λ is 0 throughout, and no trace has to be kept
     """
 
+    table: DenseTable
+
     def __init__(
         self,
         perceiver: Perceiver,
@@ -179,6 +231,7 @@ class TorchLearner(Learner):
         self.probabilities = values.new_zeros(shape)
         n_blocks = len(rule.blocks) - 1
         self.entries = th.zeros((*shape, n_blocks), dtype=th.int64, device=values.device)
+        self.shape = (*shape, n_blocks)
         #: what each environment is exploring, see :meth:`~sb3_knntd.rules.ActionRule.hold`
         self.held = th.full((n_envs, n_blocks), UNDRAWN, dtype=th.int64, device=values.device)
         #: see :func:`~sb3_knntd.kernels.step.count_steps`; on the CPU, where it is known which episodes ended
@@ -254,11 +307,10 @@ class TorchLearner(Learner):
             "traces": self.traces.state(),
         }
 
-    def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
+    def _forget(self) -> None:
         self.traces.clear()
-        self.in_episodes = state_dict["entries"].shape == self.entries.shape
-        if not self.in_episodes:
-            return
+
+    def _take_over(self, state_dict: dict[str, Any]) -> None:
         for name in ("indices", "probabilities", "entries", "held"):
             getattr(self, name).copy_(state_dict[name])
         self.lengths[:] = state_dict["lengths"].numpy()

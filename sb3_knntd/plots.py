@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.checks import check_integer, check_number, shown
 from sb3_knntd.rules import mean_rows
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Resolution of the files, dots per inch.
 DPI = 150
+#: Cells in each dimension of a picture: more than there are dots.
+FINEST = 4096
 #: More actions than this are shown by number on a scale, since their names would not find room.
 MOST_NAMED_ACTIONS = 10
 #: Observations whose values are read in one go. With thousands of points more would take gigabytes.
@@ -85,6 +88,51 @@ class ValueGrid(NamedTuple):
     learned: np.ndarray
 
 
+def check_dims(dims: Any) -> tuple[int, int]:
+    """
+    :param dims: what was given as ``dims``
+    :return: two different dimensions
+    :raises ValueError: if it is anything else
+    """
+    try:
+        across, up = (check_integer("dims", dim, 0) for dim in dims)
+    except (TypeError, ValueError):
+        across = up = 0
+    if across == up:
+        raise ValueError(f"dims must be two different dimensions, counted from 0; got {shown(dims)}")
+    return across, up
+
+
+def check_fixed(fixed: Any) -> dict[int, float] | None:
+    """
+    :param fixed: what was given as ``fixed``
+    :return: dimensions, and where each is held
+    :raises ValueError: if it is anything else, or not finite
+    """
+    if fixed is None:
+        return None
+    if not isinstance(fixed, Mapping):
+        raise ValueError(f"fixed must give dimensions and where to hold them, {{2: 0.0}} say; got {shown(fixed)}")
+    return {check_integer("fixed: a dimension", dim, 0): check_number("fixed", fixed[dim]) for dim in fixed}
+
+
+def check_names(names: Any) -> Names | None:
+    """
+    :param names: what was given as ``names``
+    :return: the same
+    :raises ValueError: if it is neither ``None`` nor two lists of words
+    """
+    if names is None:
+        return None
+    try:
+        checked = Names(*map(tuple, names))
+    except TypeError as error:
+        raise ValueError(f"names must be plots.Names(observations, actions); got {shown(names)}") from error
+    if not all(isinstance(name, str) for name in (*checked.observations, *checked.actions)):
+        raise ValueError(f"names must be plots.Names(observations, actions), of words; got {shown(names)}")
+    return checked
+
+
 def running_median(values: Sequence[float] | np.ndarray, window: int) -> np.ndarray:
     """
     :param values: shape (n,)
@@ -92,8 +140,7 @@ def running_median(values: Sequence[float] | np.ndarray, window: int) -> np.ndar
     :return: the median of each value and the ``window - 1`` before it (fewer at the beginning), shape (n,)
     :raises ValueError: if ``window`` < 1
     """
-    if window < 1:
-        raise ValueError(f"window must be at least 1; got {window}")
+    check_integer("window", window, 1)
     return np.array([np.median(values[max(0, end - window) : end]) for end in range(1, len(values) + 1)])
 
 
@@ -183,11 +230,11 @@ def plot_learning_curve(
     :return: the axes drawn on; :func:`figure_of` tells their figure
     :raises ValueError: if ``steps`` and ``returns`` differ in length
     """
-    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
-
     if len(steps) != len(returns):
         raise ValueError(f"steps and returns must be of the same length; got {len(steps)} and {len(returns)}")
     axes = axes if axes is not None else new_figure(7.0, 4.2).add_subplot()
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
     if len(returns) == 0:
         axes.text(0.5, 0.75, "no episode has ended", transform=axes.transAxes, ha="center", va="center")
     else:
@@ -366,6 +413,7 @@ def names_for(model: KNNAlgorithm, names: Names | None = None) -> Names:
     :return: these, or else those in ``NAMES`` of the model's environment, or else numbers
     :raises ValueError: if ``names`` does not fit the model's spaces
     """
+    names = check_names(names)
     if names is not None and not _fit(names, model):
         raise ValueError(
             f"names must hold one for each observation dimension and one for each action (each action dimension with "
@@ -379,8 +427,12 @@ def new_figure(width: float, height: float) -> Figure:
     :param width: inches
     :param height: inches
     :return: a figure that belongs to no window and to no global state; save it with ``figure.savefig(path)``
+    :raises ImportError: if matplotlib is not installed
     """
-    from matplotlib.figure import Figure
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError('pictures need matplotlib: pip install "sb3-knntd[extra]"') from error
 
     return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
 
@@ -449,15 +501,14 @@ def _check_view(
     if not isinstance(space, spaces.Box) or space.shape[0] < 2:
         raise ValueError(f"a value function is drawn over two dimensions of a Box of observations; got {space}")
     n_dims = space.shape[0]
-    if len(dims) != 2 or dims[0] == dims[1] or not all(dim in range(n_dims) for dim in dims):
+    if max(check_dims(dims)) >= n_dims:
         raise ValueError(f"dims must be two different dimensions of 0 to {n_dims - 1}; got {dims!r}")
-    given = dict(fixed or {})
+    given = check_fixed(fixed) or {}
     if not all(dim in range(n_dims) and dim not in dims for dim in given):
         raise ValueError(
             f"fixed must name dimensions of 0 to {n_dims - 1} other than those drawn, {dims}; got {given!r}"
         )
-    if resolution < 1:
-        raise ValueError(f"resolution must be at least 1; got {resolution}")
+    check_integer("resolution", resolution, 1, FINEST)
     low, high = _range(model)
     others = [dim for dim in range(n_dims) if dim not in dims]
     held = {dim: float(given.get(dim, (low[dim] + high[dim]) / 2)) for dim in others if dim in given or not average}

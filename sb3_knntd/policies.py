@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any, ClassVar
 
+import cloudpickle
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -14,7 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_knntd.actions import ActionColumns, make_action_columns
-from sb3_knntd.checks import check_number, check_word
+from sb3_knntd.checks import check_flag, check_number, check_size, check_word, shown
 from sb3_knntd.exploration import greedy
 from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.step import best_entries
@@ -24,20 +25,22 @@ from sb3_knntd.perception.points import count_neighbors
 from sb3_knntd.perception.search import SEARCHES, make_search
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.rules import mean_actions, mean_rows
+from sb3_knntd.tracing import is_traced
 
 #: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
 DENSE_TABLE_BYTES = 2**28
+#: Action values are taken up to this: sums of them stay finite in float32 too.
+LARGEST_VALUE = 1e30
 
 
 class KNNPolicy(BasePolicy):
     """
     A table of action values at points of the observation space, read as a weighted mean over the k nearest.
 
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param action_space: Discrete
     :param lr_schedule: not used, there is nothing to optimise; part of SB3's signature
-    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for Discrete and
-        MultiDiscrete
+    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for all but a Box
     :param points: ``"auto"``, an int, one int a dimension, or an array (n_points, obs_dim) in observation units
     :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
@@ -55,6 +58,8 @@ class KNNPolicy(BasePolicy):
     :raises ValueError: if an argument does not fit; the message says which, and what would
     """
 
+    #: the action spaces that it is for
+    acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
     #: whether one action is chosen from the average of the neighbours' rows
     _AVERAGES: ClassVar[bool] = True
 
@@ -77,9 +82,10 @@ class KNNPolicy(BasePolicy):
         columns: ActionColumns | None = None,
     ) -> None:
         super().__init__(observation_space, action_space)
-        check_number("initial_value", initial_value)
-        if dtype not in (th.float32, th.float64):
-            raise ValueError(f"policy_kwargs: dtype must be torch.float64 or torch.float32; got {dtype!r}")
+        initial_value = check_number("initial_value", initial_value, -LARGEST_VALUE, LARGEST_VALUE)
+        if not isinstance(dtype, th.dtype) or dtype not in (th.float32, th.float64):
+            raise ValueError(f"policy_kwargs: dtype must be torch.float64 or torch.float32; got {shown(dtype)}")
+        compiled = check_flag("policy_kwargs: compiled", compiled)
         self._arguments = {
             "n_neighbors": n_neighbors,
             "points": points,
@@ -115,20 +121,36 @@ class KNNPolicy(BasePolicy):
         #: what each column of the table stands for
         self.columns = columns
         self.table = self._make_table(table, places, int(columns.blocks[-1]), initial_value, dtype)
+        check_size(
+            f"n_neighbors: the action values of {self.n_neighbors} neighbours",
+            8 * self.n_neighbors * int(columns.blocks[-1]),
+            "give fewer neighbours",
+        )
 
     def _make_table(self, table: str, places: Points, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
         check_word("policy_kwargs: table", table, ["auto", "dense", "hashed"])
+        row_bytes = n_actions * dtype.itemsize
         if table == "auto":
-            fits = places.n_points * n_actions * dtype.itemsize <= DENSE_TABLE_BYTES
+            fits = places.n_points * row_bytes <= DENSE_TABLE_BYTES
             table = "dense" if fits or not isinstance(places, Lattice) else "hashed"
         if table == "dense":
+            check_size(
+                f"points: a dense table of {places.n_points} points and {n_actions} actions",
+                places.n_points * row_bytes,
+                "give fewer points, or a lattice with policy_kwargs={'table': 'hashed'}",
+            )
             return DenseTable(places.n_points, n_actions, initial_value, dtype)
         if not self._compilable:
             raise ValueError(
                 f"points: a table of {places.n_points} points needs the compiled step, which works on the CPU with "
                 "numba and with weights that are no function. Give fewer points, or policy_kwargs={'table': 'dense'}"
             )
-        return HashedTable(n_actions, initial_value, dtype)
+        check_size(
+            f"action_points, action space: the first {HashedTable.SMALLEST} rows of a table of {n_actions} actions",
+            HashedTable.SMALLEST * row_bytes,
+            "have fewer actions",
+        )
+        return HashedTable(places.n_points, n_actions, initial_value, dtype)
 
     @property
     def is_compiled(self) -> bool:
@@ -267,7 +289,7 @@ class KNNPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         assert isinstance(self.action_space, spaces.Discrete)
-        return greedy(mean_rows(*self._rows(observation))) + int(self.action_space.start)
+        return greedy(mean_rows(*self._exact_rows(observation))) + int(self.action_space.start)
 
     def _to_tensor(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         array = observation.cpu().numpy() if isinstance(observation, th.Tensor) else np.asarray(observation)
@@ -276,7 +298,8 @@ class KNNPolicy(BasePolicy):
         return tensor
 
     def _perceive(self, observations: th.Tensor) -> Perception:
-        if not th.isfinite(observations).all():
+        # While torch records, there are no values to look at.
+        if not is_traced() and not th.isfinite(observations).all():
             raise ValueError(f"observation must be finite; got {observations.tolist()}")
         perception: Perception = self.perceiver(observations)
         return perception
@@ -285,16 +308,57 @@ class KNNPolicy(BasePolicy):
         perception = self._perceive(observations)
         return self.table.rows(perception.indices), perception.probabilities.to(self.table.values.dtype)
 
+    def _exact_rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The same in the arithmetic of the compiled search for the best entries, whatever type the table has."""
+        perception = self._perceive(observations)
+        return self.table.rows(perception.indices).double(), perception.probabilities
+
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> KNNPolicy:
         super()._apply(fn, recurse)
         self.perceiver.fit()
         return self
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        if not isinstance(state_dict, Mapping):
+            raise ValueError(f"the state of a policy must be a dict of tensors; got {str(state_dict)[:100]}")
         answer = super().load_state_dict(state_dict, strict, assign)
         # Saved bounds may differ from those of the space, where they were measured.
         self.perceiver.fit()
         return answer
+
+    def save(self, path: str) -> None:
+        """
+        Save the policy, functions among its arguments as well.
+
+        :param path: file, or file-like object
+        """
+        content = {"state_dict": self.state_dict(), "data": self._get_constructor_parameters()}
+        th.save(content, path, pickle_module=cloudpickle)
+
+    def parameters_to_vector(self) -> np.ndarray:
+        """
+        :return: the entries of :attr:`q_table`, row by row, shape (n_points * n_actions,), the table's dtype
+        """
+        vector: np.ndarray = self.q_table.detach().cpu().numpy().flatten()
+        return vector
+
+    def load_from_vector(self, vector: np.ndarray) -> None:
+        """
+        Set the entries of :attr:`q_table`, also while episodes go on. A learner's traces are let go.
+
+        :param vector: what :meth:`parameters_to_vector` of a policy with the same points returned
+        :raises ValueError: if it has another length, or is not finite
+        """
+        state = self.state_dict()
+        values = th.as_tensor(vector, dtype=self.table.values.dtype)
+        if values.shape != (self.q_table.numel(),):
+            raise ValueError(
+                f"vector must have shape ({self.q_table.numel()},), a number for each entry of q_table; got "
+                f"{tuple(values.shape)}"
+            )
+        if not th.isfinite(values).all():
+            raise ValueError("vector must be finite; got NaN or infinity in it")
+        self.load_state_dict({**state, "table.values": values.reshape(self.q_table.shape)})
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
@@ -308,7 +372,7 @@ class ExAPolicy(KNNPolicy):
     """
     A table of the values of action points, of which each neighbour recommends its best, and the mean is taken.
 
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param action_space: Box with finite bounds
     :param lr_schedule: not used
     :param action_points: see :class:`~sb3_knntd.ExA`
@@ -317,6 +381,7 @@ class ExAPolicy(KNNPolicy):
     :raises ValueError: if an argument does not fit; the message says which, and what would
     """
 
+    acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Box
     _AVERAGES: ClassVar[bool] = False
 
     def __init__(
@@ -338,6 +403,8 @@ class ExAPolicy(KNNPolicy):
         self._action_shape = None if len(action_space.shape) == 1 else (-1, *action_space.shape)
         # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
         self._can_exceed = action_space.dtype != np.float32
+        self._column_points = th.from_numpy(columns.points)
+        self._action_bounds = [th.from_numpy(bound) for bound in (action_space.low, action_space.high)]
 
     @property
     def action_points(self) -> list[th.Tensor]:
@@ -365,9 +432,14 @@ class ExAPolicy(KNNPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
-        rows, probabilities = self._rows(observation)
+        rows, probabilities = self._exact_rows(observation)
         blocks = self.columns.blocks.tolist()
         entries = [first + greedy(rows[..., first:end]) for first, end in pairwise(blocks)]
-        points = th.from_numpy(self.columns.points).to(probabilities)
+        points = self._column_points.to(probabilities)
         actions = mean_actions(th.stack(entries, dim=2), probabilities, points)
-        return th.from_numpy(self.fit_actions(actions.cpu().numpy()))
+        # As fit_actions, in torch operations, so that it can be traced.
+        if self._actions_are_whole:
+            actions = actions.round()
+        low, high = (bound.to(points.device) for bound in self._action_bounds)
+        fitting = actions.to(low.dtype).reshape(-1, *low.shape)
+        return th.minimum(th.maximum(fitting, low), high) if self._can_exceed else fitting

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_knntd.states import checked_integer, entry
+
 #: Rows made at a time, as far as these are no more numbers than NUMBERS_PER_BLOCK (8 MiB): drawing one row from NumPy
 #: costs more than taking it from a block.
 ROWS_PER_BLOCK = 1024
@@ -72,8 +74,14 @@ class RandomStream:
     def set_state(self, state: dict[str, Any]) -> None:
         """
         :param state: what :meth:`state` returned
+        :raises ValueError: if no stream can have returned it
         """
-        self._key = np.array(state["key"], dtype=np.uint64)
-        number, taken = divmod(state["position"], len(self.rows))
+        position = checked_integer(state, "position", 0, 2**62)
+        key = entry(state, "key")
+        if not isinstance(key, list) or len(key) != 2:
+            raise ValueError(f"key must be two integers; got {str(key)[:100]}")
+        words = [checked_integer({"a word of key": word}, "a word of key", 0, 2**64 - 1) for word in key]
+        self._key = np.array(words, dtype=np.uint64)
+        number, taken = divmod(position, len(self.rows))
         self._fill(number)
         self.taken[0] = taken

@@ -17,7 +17,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
-from sb3_knntd.checks import check_integer, check_number
+from sb3_knntd.checks import check_integer, check_number, shown
+from sb3_knntd.files import replace_file
 
 try:
     import ray
@@ -88,7 +89,7 @@ class EnvActor:
         if file and before and not file.read_bytes().startswith(before):
             # The new Monitor has begun the file anew. SB3's load_results reads this one beside it.
             stem = file.name.removesuffix(Monitor.EXT)
-            file.with_name(f"{stem}before_restart_{restarts}.{Monitor.EXT}").write_bytes(before)
+            replace_file(file.with_name(f"{stem}before_restart_{restarts}.{Monitor.EXT}"), before)
         for name, value in attributes.items():
             self.set_attr(name, cloudpickle.loads(value))
         monitor = unwrap_wrapper(self.env, Monitor)
@@ -230,9 +231,13 @@ class RayVecEnv(VecEnv):
         timeout: float | None = None,
         placement_timeout: float = 300.0,
     ) -> None:
+        if not isinstance(env_fns, Sequence) or not env_fns or not all(map(callable, env_fns)):
+            raise ValueError(f"env_fns must be functions that make environments, at least one; got {shown(env_fns)}")
         n_envs = len(env_fns)
-        if not n_envs or not all(map(callable, env_fns)):
-            raise ValueError(f"env_fns must be functions that make environments, at least one; got {env_fns!r}")
+        if address is not None and not isinstance(address, str):
+            raise ValueError(f"address must be 'auto', 'ray://host:port' or None; got {shown(address)}")
+        if not (actor_options is None or isinstance(actor_options, Mapping)):
+            raise ValueError(f"actor_options must be a dict of options of a Ray actor; got {shown(actor_options)}")
         options = dict(actor_options or {})
         if SETTLED & options.keys():
             raise ValueError(
@@ -250,7 +255,10 @@ class RayVecEnv(VecEnv):
             "max_restarts": 0,
             "max_task_retries": 0,
         }
-        self._actor_class = ray.remote(EnvActor).options(**options)
+        try:
+            self._actor_class = ray.remote(EnvActor).options(**options)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ValueError(f"num_cpus={num_cpus!r}, actor_options={shown(actor_options)}: {error}") from error
         asked_for = {"num_cpus": num_cpus, **(actor_options or {})}
         self._asked_for = {key: value for key, value in asked_for.items() if key != "runtime_env"}
 

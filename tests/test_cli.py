@@ -22,8 +22,8 @@ from stable_baselines3.common.monitor import load_results
 
 import sb3_knntd.cli
 import sb3_knntd.demo
-from sb3_knntd import KNNTD
-from sb3_knntd.cli import main
+from sb3_knntd import KNNTD, ExA
+from sb3_knntd.cli import CommandError, main
 
 # SB3 silences it when it is imported, which pytest undoes.
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -68,10 +68,11 @@ class CorridorEnv(gym.Env[np.ndarray, int]):
 def _registered() -> Iterator[None]:
     gym.register("Corridor-v0", CorridorEnv, max_episode_steps=20)
     gym.register("Endless-v0", CorridorEnv)
+    gym.register("Broken-v0", lambda: 1 / 0)
     gym.register("Interrupted-v0", CorridorEnv, kwargs={"interrupts": {57: 1}}, max_episode_steps=20)
     gym.register("InterruptedTwice-v0", CorridorEnv, kwargs={"interrupts": {57: 2}}, max_episode_steps=20)
     yield
-    for name in ("Corridor-v0", "Endless-v0", "Interrupted-v0", "InterruptedTwice-v0"):
+    for name in ("Corridor-v0", "Endless-v0", "Broken-v0", "Interrupted-v0", "InterruptedTwice-v0"):
         del gym.registry[name]
 
 
@@ -220,6 +221,7 @@ def test_a_second_ctrl_c_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixt
         ("MountainCar-v99", "version"),
         ("no id at all", "Malformed"),
         ("no_such_package:Env-v0", "no_such_package"),
+        ("Broken-v0", "ZeroDivisionError"),
     ],
 )
 def test_an_unknown_environment_is_refused(
@@ -233,15 +235,33 @@ def test_an_unknown_environment_is_refused(
     assert not out.exists()
 
 
+def test_continuous_actions_are_shown_with_exa(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo", "--env", "Pendulum-v1", "--steps", "400", "--out", str(tmp_path)]) == 0
+    output = capsys.readouterr().out
+    assert "Training ExA on Pendulum-v1 for 400 steps" in output
+    assert re.search(r"^ExA +-\d+\.\d\d ", output, re.MULTILINE)
+    assert re.search(r"^random policy +-\d+\.\d\d ", output, re.MULTILINE)
+    assert ExA.load(tmp_path / "exa_Pendulum-v1.zip").num_timesteps == 400
+    for picture in ("learning_curve", "value_function"):
+        assert (tmp_path / f"exa_Pendulum-v1_{picture}.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "tensorboard" / "ExA_1").is_dir()
+
+
 def test_spaces_that_do_not_fit_are_refused_in_the_words_of_the_algorithm(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    with pytest.raises(ValueError, match="Discrete") as refusal:
-        KNNTD("Pendulum-v1")
-    error = error_of(["demo", "--env", "Pendulum-v1", "--out", str(out)], capsys)
+    with pytest.raises(ValueError, match="Tuple") as refusal:
+        KNNTD("Blackjack-v1")
+    error = error_of(["demo", "--env", "Blackjack-v1", "--out", str(out)], capsys)
     assert " ".join(str(refusal.value).split()) in error
     assert not out.exists()
+
+
+def test_where_an_error_came_from_is_shown_on_demand(tmp_path: Path) -> None:
+    with pytest.raises(CommandError, match="Broken-v0") as error:
+        main(["--traceback", "demo", "--env", "Broken-v0", "--out", str(tmp_path)])
+    assert isinstance(error.value.__cause__, ZeroDivisionError)
 
 
 @pytest.mark.parametrize("steps", ["0", "-5", "1.5", "many"])

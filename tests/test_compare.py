@@ -29,12 +29,13 @@ import sb3_knntd.cli
 from sb3_knntd import KNNTD
 from sb3_knntd.cli import main
 from sb3_knntd.compare import statistics
+from sb3_knntd.compare.cautions import cautions
 from sb3_knntd.compare.configurations import Configuration, configuration, fits, label
 from sb3_knntd.compare.experiment import experiment, prepare
-from sb3_knntd.compare.report import Comparison, cautions, make_report, median, task_rows
-from sb3_knntd.compare.results import Group, Run, Task, make_groups
+from sb3_knntd.compare.report import make_report
+from sb3_knntd.compare.results import Comparison, Group, Run, Task, make_groups
 from sb3_knntd.compare.run import Recorder, run
-from sb3_knntd.compare.statistics import aggregates, curves, improvements, profiles
+from sb3_knntd.compare.statistics import aggregates, curves, improvements, profiles, task_rows
 from sb3_knntd.jobs import Job, Outcome, run_jobs, run_locally
 
 CHROMIUM = Path("/usr/bin/chromium")
@@ -289,14 +290,22 @@ def test_algorithms_fit_by_their_actions() -> None:
         (["--threshold", "high"], "--threshold: could not convert string to float: 'high'"),
         (["--threshold", "inf"], "--threshold must be finite; got MountainCar-v0=inf"),
         (["--threshold", "CartPole-v1=3"], "--threshold: 'CartPole-v1' is not among MountainCar-v0"),
+        (["--env", "no_such_module:Env-v0"], "--env: 'no_such_module:Env-v0' cannot be made: No module named"),
         (["--gym-packages", "no_such_module"], "--gym-packages: No module named 'no_such_module'"),
+        (["--gym-packages", "raising_module"], "--gym-packages: RuntimeError: no licence for this"),
         (["--backend", "ray", "--cpus-per-run", "-1"], "must be a number above 0; got '-1'"),
         (["--first-seed", "2147483640"], "seeds go to 2147483647; got 10 from 2147483640 on"),
     ],
 )
 def test_a_mistake_is_told_of_before_anything_is_computed(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    (tmp_path / "raising_module.py").write_text("raise RuntimeError('no licence for this')")
+    monkeypatch.syspath_prepend(tmp_path)
     command = ["compare", "--env", "MountainCar-v0", "--algos", "knntd", "--out", str(tmp_path / "out"), *arguments]
     with pytest.raises(SystemExit, match="2"):
         main(command)
@@ -332,13 +341,15 @@ def test_costs_to_a_threshold() -> None:
     assert one.cost_to(100.0) == (300.0, 4.0)
     assert one.cost_to(100.1) == (math.inf, math.inf)
     assert (one.steps_per_second, one.cpu_share) == (50.0, 1.0)
-    assert median(iter([3.0, math.inf, 1.0])) == 3.0
-    assert median(iter([3.0, math.inf, math.inf, 1.0])) == math.inf
-    assert median(iter([4.0, 1.0])) == 2.5
 
     rows = {row["algo"]: row for row in task_rows(task({"knntd": [[0, 100], [0, 0], [100, 0]], "random": [[0, 0]]}))}
     assert (rows["knntd"]["reached"], rows["knntd"]["steps_to_threshold"]) == (2, 200.0)
     assert (rows["random"]["reached"], rows["random"]["steps_to_threshold"]) == (0, math.inf)
+    # Half of the seeds are not more than half of them.
+    (half, _) = task_rows(task({"knntd": [[100, 0], [100, 0], [0, 0], [0, 0]], "random": [[0, 0]]}))
+    assert half["steps_to_threshold"] == math.inf
+    (all_, _) = task_rows(task({"knntd": [[100, 0], [0, 100]], "random": [[0, 0]]}))
+    assert all_["steps_to_threshold"] == 150.0
     (unknown, _) = task_rows(task({"knntd": [[0, 100]], "random": [[0, 0]]}, threshold=None))
     assert math.isnan(unknown["steps_to_threshold"])
 

@@ -1,4 +1,4 @@
-"""The package against `reference.py`: the same perceptions, the same choices, the same table.
+"""The package against `examples/knn_td_from_scratch.py`: the same perceptions, the same choices, the same table.
 
 A run is recorded at the border between learner and environments and replayed through the reference with
 the actions that were taken. A greedy run must also be one the reference would have chosen by itself, step for
@@ -18,11 +18,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import (
+from knn_td_from_scratch import (
     ExactStates,
+    KNNTDAgent,
     NearestPoints,
     Rates,
-    ReferenceKNNTD,
     Transition,
     lattice,
     make_perceiver,
@@ -141,9 +141,9 @@ def make_reference(
     exploration_fraction: float = 0.0,
     policy_kwargs: Any = None,
     **perception: Any,
-) -> ReferenceKNNTD:
+) -> KNNTDAgent:
     """The reference for the same arguments; those of time go to `rates_at`, those of precision nowhere."""
-    return ReferenceKNNTD(
+    return KNNTDAgent(
         make_perceiver(venv.observation_space, **perception),
         int(venv.action_space.n),  # type: ignore[attr-defined]
         venv.num_envs,
@@ -197,7 +197,7 @@ def transitions(steps: Sequence[VecStep]) -> Iterator[list[Transition]]:
         yield together
 
 
-def replay(venv: RecordingVecEnv, n_steps: int, *, greedy: bool, **arguments: Any) -> ReferenceKNNTD:
+def replay(venv: RecordingVecEnv, n_steps: int, *, greedy: bool, **arguments: Any) -> KNNTDAgent:
     """The reference after the recorded steps.
 
     :param greedy: the run did not explore, so each recorded action must be the reference's own; it is chosen
@@ -226,7 +226,7 @@ def set_table(model: KNNTD, values: np.ndarray) -> None:
         model.policy.q_table.copy_(torch.as_tensor(values))
 
 
-def assert_same_table(model: KNNTD, learner: ReferenceKNNTD, tolerance: float = 1e-9) -> None:
+def assert_same_table(model: KNNTD, learner: KNNTDAgent, tolerance: float = 1e-9) -> None:
     got, expected = table(model), learner.q_table
     # Equal tables are no evidence where nothing was learned or everything ran away.
     assert np.isfinite(expected).all()

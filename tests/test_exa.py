@@ -1,4 +1,4 @@
-"""Ex⟨a⟩(lambda): the table against `reference_exa.py`, and what it alone has; the rest is tested over both."""
+"""Ex⟨a⟩(λ): the table against `examples/exa_from_scratch.py`, and what it alone has; the rest is tested over both."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from exa_from_scratch import Choice, ExAAgent, Transition
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import NearestPoints, Rates
-from reference_exa import Choice, ReferenceExA, Transition
+from knn_td_from_scratch import NearestPoints, Rates
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -84,23 +84,21 @@ def message_of(make: Callable[[], Any]) -> str:
 # ------------------------------------------------------------------------------------- against the reference
 
 
-def explored(learner: ReferenceExA, own: Choice, taken: np.ndarray) -> Choice:
+def explored(learner: ExAAgent, own: Choice, taken: np.ndarray) -> Choice:
     """
     The choice behind an action of an environment that explores the same column for all neighbours: part by part the
     column that the action lies on, or where it lies on none the one that each neighbour recommends.
     """
-    entries = own.entries.copy()
+    columns = own.columns.copy()
     for number, part in enumerate(learner.parts):
         seen = taken[number : number + 1] if learner.factored else taken
         (exact,) = np.nonzero(np.abs(part - seen).max(axis=1) < 1e-12)
         if len(exact):
-            entries[:, number] = exact[0]
-    return Choice(own.neighbours, entries)
+            columns[:, number] = exact[0]
+    return Choice(own.neighbours, columns)
 
 
-def replay(
-    venv: RecordingVecEnv, learner: ReferenceExA, rates: Rates, tolerance: float = 1e-9
-) -> tuple[ReferenceExA, float]:
+def replay(venv: RecordingVecEnv, learner: ExAAgent, rates: Rates, tolerance: float = 1e-9) -> tuple[ExAAgent, float]:
     """
     The reference after the recorded steps; each recorded action must be the reference's own, chosen with the table
     as it is when the observation arrives, or one that was explored.
@@ -116,7 +114,7 @@ def replay(
             own = learner.recommend(state)
             if rates.epsilon > 0.0:
                 choice = explored(learner, own, taken.ravel())
-                n_explored += not np.array_equal(choice.entries, own.entries)
+                n_explored += not np.array_equal(choice.columns, own.columns)
             else:
                 choice = own
             n_choices += 1
@@ -183,7 +181,7 @@ def check(
 
     rates = Rates(chosen.pop("learning_rate"), chosen.pop("trace_decay"), epsilon)
     perceive = NearestPoints(chosen.pop("points"), BOUNDS, chosen.pop("n_neighbors"))
-    reference = ReferenceExA(perceive, lists, n_envs, factored=action_table == "factored", **chosen)
+    reference = ExAAgent(perceive, lists, n_envs, factored=action_table == "factored", **chosen)
     reference, share = replay(venv, reference, rates)
     got, expected = table(model), reference.q_table
     # Equal tables are no evidence where nothing was learned or everything ran away.
@@ -244,7 +242,7 @@ def test_one_environment_ends_early(learner: str) -> None:
     ).learn(3 * 39)  # fmt: skip
     assert sum(step.terminated[1] + step.truncated[1] for step in venv.steps) > 5
     assert not any(step.terminated[0] or step.terminated[2] for step in venv.steps)
-    reference = ReferenceExA(NearestPoints((8, 6), BOUNDS, 4), ONE, 3, gamma=0.97)
+    reference = ExAAgent(NearestPoints((8, 6), BOUNDS, 4), ONE, 3, gamma=0.97)
     reference, _ = replay(venv, reference, Rates(0.2, 0.95))
     np.testing.assert_allclose(table(model), reference.q_table, rtol=1e-9, atol=1e-9)
 
@@ -481,7 +479,7 @@ def test_recommendation_is_the_references(learner: str, action_table: str) -> No
         make_venv(shape=(2,)), action_points=TWO, action_table=action_table, policy_kwargs=LEARNERS[learner]
     )
     set_random_table(model, 1)
-    reference = ReferenceExA(NearestPoints((8, 6), BOUNDS, 4), TWO, factored=action_table == "factored")
+    reference = ExAAgent(NearestPoints((8, 6), BOUNDS, 4), TWO, factored=action_table == "factored")
     ends = np.cumsum([part.shape[0] for part in reference.parts])[:-1]
     # Its ties go to the first, as those of deterministic predictions must whatever tie_break says.
     reference.tables = np.split(table(model), ends, axis=1)
@@ -691,7 +689,12 @@ def test_single_precision() -> None:
         ({"action_table": "both"}, ["action_table", "'joint'", "'factored'", "'both'"]),
         ({"action_table": "joint", "action_points": 1200}, ["1,440,000 columns", "2 action dimensions", "'factored'"]),
         ({"exploration": "softmax"}, ["exploration", "'shared'", "'per_neighbor'", "'softmax'"]),
-        ({"exploration_hold": 0.5}, ["exploration_hold", "[1, inf)", "0.5"]),
+        ({"exploration_hold": 0.5}, ["exploration_hold", "[1, 1e+15]", "0.5"]),
+        ({"exploration_hold": 1e308}, ["exploration_hold", "[1, 1e+15]", "1e+308"]),
+        ({"exploration_hold": b"2"}, ["exploration_hold", "[1, 1e+15]"]),
+        ({"action_points": 1j}, ["action_points", ">= 2"]),
+        ({"action_points": [["-1", "1"]]}, ["action_points", "numbers"]),
+        ({"action_points": [[False, True]]}, ["action_points", "numbers"]),
         ({"exploration_hold": float("nan")}, ["exploration_hold", "nan"]),
         ({"exploration_hold": "long"}, ["exploration_hold", "'auto'", "'long'"]),
         ({"exploration_initial_eps": 1.1}, ["exploration_initial_eps", "[0, 1]", "1.1"]),

@@ -48,6 +48,28 @@ def test_tank_level(run: Callable[..., str], tmp_path: Path) -> None:
     assert (tmp_path / "tank_level.png").read_bytes().startswith(PNG)
 
 
+def test_knn_td_from_scratch(run: Callable[..., str]) -> None:
+    printed = run("knn_td_from_scratch.py")
+    first, *_, last = re.findall(r"episodes .* mean return (\S+)\n", printed)
+    (greedy,) = re.findall(r"greedy policy: mean return (\S+)", printed)
+    # An episode that does not reach the goal has 200 steps; the environment counts as solved at -110.
+    assert float(first) < -190.0
+    assert float(last) >= -110.0
+    assert float(greedy) >= -110.0
+
+
+def test_exa_from_scratch(run: Callable[..., str]) -> None:
+    (greedy,) = re.findall(r"greedy policy: mean return (\S+)", run("exa_from_scratch.py"))
+    # The environment counts as solved at 90.
+    assert float(greedy) >= 90.0
+
+
+def test_delta_filter_from_scratch(run: Callable[..., str]) -> None:
+    pairs = re.findall(r"error (\S+) of the sensor, (\S+) of the filter", run("delta_filter_from_scratch.py"))
+    assert len(pairs) == 2
+    assert all(float(filtered) < 0.85 * float(sensed) for sensed, filtered in pairs)
+
+
 def test_cliff_walking(run: Callable[..., str]) -> None:
     pattern = r"(\w+): greedy route of (\d+) steps, return while training (\S+)"
     lines = re.findall(pattern, run("cliff_walking.py"))

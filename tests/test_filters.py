@@ -14,10 +14,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from delta_filter_from_scratch import PaperFilter
 from gymnasium import spaces
+from knn_td_from_scratch import NearestPoints
 from numpy.typing import NDArray
-from reference import NearestPoints
-from reference_filter import ReferenceFilter
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -148,7 +148,7 @@ def test_equals_algorithm_5(n_envs: int, reference: str, update: str | None, com
     venv = VecDeltaFilter(
         make_venv(n_envs), reference=reference, update=update, compiled=compiled, **PERCEPTION, **PAPER
     )
-    model = ReferenceFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2, own_errors=update == "averaging")
+    model = PaperFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2, own_errors=update == "averaging")
     observations, actions, dones, infos = walk(venv, 60)
     last = [raw.copy() for raw in observations[0]]
     for seen, action, done, info in zip(observations[1:], actions, dones, infos, strict=True):
@@ -185,7 +185,7 @@ def test_the_environment_wrapper_equals_the_vec_wrapper() -> None:
 def test_a_schedule_goes_over_its_steps() -> None:
     arguments = {**PERCEPTION, **PAPER, "learning_rate": lambda progress: progress, "total_timesteps": 40}
     env = DeltaFilter(Noisy(lengths=(100,)), **arguments)
-    model = ReferenceFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2)
+    model = PaperFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2)
     last, _ = env.reset()
     for step in range(50):
         seen, _, _, _, info = env.step(step % 3)
@@ -561,7 +561,7 @@ def test_weights_and_schedules_are_saved(tmp_path: pathlib.Path) -> None:
     venv = VecDeltaFilter(make_venv(), **arguments)
     walk(venv, 100)
     venv.save(tmp_path / "filter")
-    loaded = VecDeltaFilter.load(tmp_path / "filter", make_venv())
+    loaded = VecDeltaFilter.load(tmp_path / "filter", make_venv(), trusted=True)
     assert loaded.table.rate() == pytest.approx(0.2 * 0.8)
     venv.set_venv(make_venv())
     np.testing.assert_array_equal(walk(venv, 50)[0], walk(loaded, 50)[0])
@@ -639,6 +639,18 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "adaptive gain": ({"reference": "observed"}, "gain='adaptive' needs reference='filtered'"),
     "warmup": ({"warmup": -1}, "warmup must be a finite number"),
     "compiled": ({"compiled": "yes"}, "compiled must be True or False"),
+    "training word": ({"training": "no"}, "training must be True or False; got 'no'"),
+    "training number": ({"training": 0.5}, "training must be True or False; got 0.5"),
+    "training NaN": ({"training": np.nan}, "training must be True or False; got nan"),
+    "training None": ({"training": None}, "training must be True or False; got None"),
+    "truth for a number": ({"warmup": True}, "warmup must be a finite number.*True"),
+    "bytes for a number": ({"bandwidth": b"1"}, "bandwidth must be a finite number.*b'1'"),
+    "words for gains": ({"gain": ["0.1", "0.2"]}, "gain must be 'adaptive'"),
+    "truth for a gain": ({"gain": np.True_}, "gain must be 'adaptive'"),
+    "complex gain": ({"gain": 0.5j}, "gain must be 'adaptive'"),
+    "tiny bandwidth": ({"bandwidth": 1e-320}, "bandwidth must be a finite number"),
+    "complex points": ({"points": [[0j, 1j], [1j, 0j]]}, "points.*numbers"),
+    "words for bounds": ({"bounds": (["0", "0"], ["1", "1"])}, "bounds must be None"),
     "n_neighbors": ({"n_neighbors": 0}, "n_neighbors must be an integer >= 1"),
     "points": ({"points": (3, 4, 5)}, "points: one int for each of the 2"),
     "too many points": ({"points": 50_000}, "points: a table of 2,500,000,000 points"),

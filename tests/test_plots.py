@@ -15,6 +15,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from matplotlib.axes import Axes
+from sb3_knntd.callbacks import EpisodeVideoCallback, ValueMapCallback
 
 from sb3_knntd import KNNTD
 from sb3_knntd.plots import (
@@ -66,7 +67,7 @@ def test_running_median() -> None:
     np.testing.assert_array_equal(running_median([5.0, 1.0, 3.0, 9.0, 2.0], 3), [5, 3, 3, 3, 3])
     np.testing.assert_array_equal(running_median([5.0, 1.0], 1), [5, 1])
     assert len(running_median([], 3)) == 0
-    with pytest.raises(ValueError, match="window must be at least 1; got 0"):
+    with pytest.raises(ValueError, match="window must be an integer >= 1; got 0"):
         running_median([1.0], 0)
 
 
@@ -241,7 +242,7 @@ def test_telling_dimensions_are_those_the_value_changes_along() -> None:
         ({"dims": (0, 1, 2)}, "dims must be two different"),
         ({"fixed": {1: 0.5}}, r"fixed must name dimensions .* other than those drawn, \(0, 1\); got {1: 0.5}"),
         ({"fixed": {7: 0.5}}, "fixed must name dimensions"),
-        ({"resolution": 0}, "resolution must be at least 1; got 0"),
+        ({"resolution": 0}, "resolution must be an integer from 1 to 4096; got 0"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(arguments: dict[str, Any], message: str) -> None:
@@ -283,3 +284,41 @@ def test_settings_of_the_user_are_left_alone() -> None:
     plot_learning_curve([1, 2], [1.0, 2.0])
     plot_value_function(make_model([0, 0], [1, 1]), resolution=5)
     assert dict(matplotlib.rcParams) == before
+
+
+# -------------------------------------------------------- what is not installed
+
+
+def hide(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    """Have it not installed, whatever of it was imported before."""
+    for name in [package, *(name for name in sys.modules if name.startswith(f"{package}."))]:
+        monkeypatch.setitem(sys.modules, name, None)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda model: plot_value_function(model, resolution=3),
+        lambda model: plot_learning_curve([1, 2], [0.0, 1.0]),
+        lambda model: model.learn(10, callback=ValueMapCallback(folder="maps")),
+    ],
+    ids=["value function", "learning curve", "map callback"],
+)
+def test_without_matplotlib_pictures_say_what_to_install(
+    draw: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    model = make_model([0.0, 0.0], [1.0, 1.0])
+    hide(monkeypatch, "matplotlib")
+    with pytest.raises(ImportError, match=r'matplotlib: pip install "sb3-knntd\[extra\]"'):
+        draw(model)
+    assert model.num_timesteps == 0
+
+
+def test_without_pillow_a_video_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, watched = make_model([0.0, 0.0], [1.0, 1.0]), StillEnv([0.0, 0.0], [1.0, 1.0], spaces.Discrete(3))
+    watched.render_mode = "rgb_array"
+    hide(monkeypatch, "PIL")
+    with pytest.raises(ImportError, match=r'Pillow: pip install "sb3-knntd\[extra\]"'):
+        model.learn(10, callback=EpisodeVideoCallback(watched, folder=tmp_path))
+    assert model.num_timesteps == 0

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from reference import NearestPoints
+from knn_td_from_scratch import NearestPoints
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -640,7 +640,7 @@ def in_a_new_process(**environment: str) -> dict[str, Any]:
     run = subprocess.run(
         [sys.executable, "-c", IN_A_NEW_PROCESS],
         cwd=pathlib.Path(__file__).parent,
-        env={**os.environ, **environment},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
         capture_output=True,
         text=True,
         timeout=300,

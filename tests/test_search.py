@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import lattice, squared_distances
+from knn_td_from_scratch import lattice, squared_distances
 from toy_envs import StillEnv
 
 from sb3_knntd import KNNTD
@@ -302,7 +302,7 @@ def test_hnsw_finds_nearly_all(scattered: tuple[Scattered, np.ndarray]) -> None:
 
 def test_hnsw_is_the_same_every_time(scattered: tuple[Scattered, np.ndarray]) -> None:
     pytest.importorskip("voyager")
-    points, scaled = Scattered(scattered[0].places[:5_000]), scattered[1]
+    points, scaled = Scattered(scattered[0].places[:5_000].numpy()), scattered[1]
     first = query("hnsw", points, 16, scaled)
     assert_same(query("hnsw", points, 16, scaled), first)
     # One by one or together is the same, too.

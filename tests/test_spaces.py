@@ -143,7 +143,11 @@ def test_exact_tables_take_what_says_the_same(arguments: dict[str, Any]) -> None
     assert KNNTD(SpaceEnv(spaces.Discrete(5)), **arguments).policy.q_table.shape == (5, 2)
 
 
-@pytest.mark.parametrize("space", [spaces.Discrete(5), spaces.MultiDiscrete([2, 3])], ids=["Discrete", "MultiDiscrete"])
+@pytest.mark.parametrize(
+    "space",
+    [spaces.Discrete(5), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3)],
+    ids=["Discrete", "MultiDiscrete", "MultiBinary"],
+)
 @pytest.mark.parametrize("arguments", [{"n_neighbors": 2}, {"points": 4}, {"bounds": ([0], [1])}])
 def test_exact_tables_have_nothing_to_choose(space: spaces.Space[Any], arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments))):
@@ -159,7 +163,7 @@ OBSERVATIONS: dict[str, tuple[spaces.Space[Any], str]] = {
     "nothing": (spaces.Box(0.0, 1.0, (0,)), "shape (n,)"),
     "Dict": (spaces.Dict({"a": spaces.Discrete(2), "b": spaces.Box(0.0, 1.0, (2,))}), "FlattenObservation"),
     "Tuple": (spaces.Tuple((spaces.Discrete(2), spaces.Discrete(2))), "FlattenObservation"),
-    "MultiBinary": (spaces.MultiBinary(3), "Box"),
+    "MultiBinary of two axes": (spaces.MultiBinary([2, 3]), "one axis"),
     "MultiDiscrete of two axes": (spaces.MultiDiscrete(np.full((2, 2), 3)), "one axis"),
     "Text": (spaces.Text(5), "Box"),
 }

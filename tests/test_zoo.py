@@ -17,6 +17,7 @@ import optuna
 import pytest
 import yaml
 from gymnasium import spaces
+from gymnasium.envs.classic_control import MountainCarEnv
 from matplotlib import pyplot as plt
 from optuna.samplers import BaseSampler, RandomSampler
 from sqlalchemy.exc import IntegrityError, OperationalError
@@ -28,10 +29,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import sb3_knntd.cli
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.cli import main
+from sb3_knntd.cli import CommandError, main
+from sb3_knntd.schedules import parse_schedule
 from sb3_knntd.zoo import experiment, register
 from sb3_knntd.zoo.configuration_first import ConfigurationFirst
-from sb3_knntd.zoo.schedules import parse_schedule, with_schedules
+from sb3_knntd.zoo.schedules import with_schedules
 from sb3_knntd.zoo.search_space import CONVERTERS, OBS_DIM, SAMPLERS, attributes, study_values
 
 # SB3 silences the one when it is imported, which pytest undoes; the other is RL Zoo's word on an unnamed study.
@@ -162,11 +164,12 @@ def test_training_goes_on_from_a_saved_model(trained: tuple[str, Path], tmp_path
 
 @pytest.mark.parametrize(("name", "value"), [("points", 4), ("n_neighbors", 2)])
 def test_training_cannot_go_on_with_another_table(
-    trained: tuple[str, Path], name: str, value: int, tmp_path: Path
+    trained: tuple[str, Path], name: str, value: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     algo, run = trained
-    with pytest.raises(ValueError, match=f"{name} cannot be given with -i"):
+    with pytest.raises(SystemExit, match="2"):
         train(tmp_path, algo, ENVS[algo], "-n", 300, "-i", run / f"{ENVS[algo]}.zip", "-params", f"{name}:{value}")
+    assert f"{name} cannot be given with -i" in capsys.readouterr().err
 
 
 def test_record_video(trained: tuple[str, Path], tmp_path: Path) -> None:
@@ -275,11 +278,6 @@ def test_schedules_in_words() -> None:
 def test_a_word_that_is_no_schedule(word: str) -> None:
     with pytest.raises(ValueError, match=f"trace_decay must be a number, 'lin_START'.*got {word!r}"):
         with_schedules({"trace_decay": word})
-
-
-def test_a_mistaken_schedule_on_the_command_line(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"learning_rate must be a number.*got 'cos_0.5'"):
-        train(tmp_path, "knntd", "MountainCar-v0", "-n", 100, "-params", "learning_rate:'cos_0.5'")
 
 
 # --------------------------------------------------------------- optimisation
@@ -487,9 +485,112 @@ def test_unknown_algorithm(capsys: pytest.CaptureFixture[str]) -> None:
     assert sys.argv == argv
 
 
-def test_unknown_environment_suggests_another(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="you maybe meant sb3_knntd/MountainCar-v0"):
-        train(tmp_path, "knntd", "sb3_knntd/MountainCar-v")
+#: What is wrong, by the arguments of ``train``, and what the line says of it.
+MISTAKES: dict[str, tuple[list[str], str]] = {
+    "environment": (["--env", "sb3_knntd/MountainCar-v"], "you maybe meant sb3_knntd/MountainCar-v0?"),
+    "spaces": (["--env", "Pendulum-v1"], "KNNTD takes actions in a Discrete space"),
+    "algorithm": (["--algo", "qlearning"], "argument --algo: invalid choice: 'qlearning'"),
+    "unknown argument": (["--episodes", "5"], "unrecognized arguments: --episodes 5"),
+    "a word for a number": (["-n", "many"], "argument -n/--n-timesteps: invalid int value: 'many'"),
+    "unknown parameter": (["-params", "nosuch:1"], "unexpected keyword argument 'nosuch'"),
+    "value of a parameter": (["-params", "gamma:2"], "gamma must be a finite number in [0, 1]; got 2"),
+    "parameter without a value": (["-params", "gamma"], "argument -params/--hyperparams: must be NAME:VALUE"),
+    "parameter that is no Python": (["-params", "weights:gaussian"], "got weights:gaussian: name 'gaussian' is not"),
+    "schedule": (["-params", "learning_rate:'cos_0.5'"], "learning_rate must be a number, 'lin_START'"),
+    "size": (["-params", "points:[10**9,10**9]"], "29.8 GiB"),
+    "environment's arguments": (["--env-kwargs", "nosuch:1"], "unexpected keyword argument 'nosuch'"),
+    "missing file": (["--conf-file", "missing.yml"], "No such file or directory: 'missing.yml'"),
+    "file that is no YAML": (["--conf-file", "broken.yml"], "ParserError"),
+    "file without the entry": (["--conf-file", "other.yml"], "Hyperparameters not found for knntd-MountainCar-v0"),
+    "file of something else": (["--conf-file", "list.yml"], "'list' object has no attribute"),
+    "missing model": (["-i", "missing.zip"], "trained_agent must be a valid path"),
+    "model that is none": (["-i", "broken.zip"], "broken.zip is no saved model"),
+    "module": (["--gym-packages", "no_such_module"], "No module named 'no_such_module'"),
+    "device": (["--device", "abacus"], "device must be 'cpu'"),
+    "seed": (["--seed", str(2**40)], "Seed must be between"),
+    "folder": (["-f", "broken.yml"], "Not a directory"),
+    "log": (["-tb", "broken.yml"], "Not a directory"),
+    "trials": (["--optimize", "--n-trials", "0", "--no-optim-plots"], "No trials are completed yet"),
+    "storage": (["--optimize", "--storage", "nosuch://x", "--study-name", "s"], "nosuch"),
+    "parameter of a study": (["--optimize", "--n-trials", "1", "-params", "nosuch:1"], "keyword argument 'nosuch'"),
+}
+
+
+@pytest.fixture
+def mistaken_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, content in {
+        "broken.yml": "a: [1, 2\nb: }",
+        "other.yml": "CartPole-v1: {gamma: 0.9}",
+        "list.yml": "[1]",
+    }.items():
+        (tmp_path / name).write_text(content)
+    (tmp_path / "broken.zip").write_text("hello")
+
+
+def line_of(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Run a command that is refused; return the only line on standard error."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        main(argv)
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1, error
+    assert error.startswith(f"sb3-knntd {argv[0]}: error: ")
+    return error
+
+
+@pytest.mark.usefixtures("mistaken_files")
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, says = MISTAKES[mistake]
+    argv = ["train", "--algo", "knntd", "--env", "MountainCar-v0", "-n", "30", "-f", "logs", "--eval-freq", "-1"]
+    assert says in line_of([*argv, *arguments], capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["enjoy", "--env", "MountainCar-v0", "-f", "nowhere"], "The nowhere/knntd folder was not found"),
+        (["enjoy", "--env", "MountainCar-v0", "--gym-packages", "no_such_module"], "No module named 'no_such_module'"),
+        (["enjoy", "--env-kwargs", "goal"], "argument --env-kwargs: must be NAME:VALUE"),
+        (["record_video", "--env", "MountainCar-v0", "-f", "nowhere"], "The nowhere/knntd folder was not found"),
+    ],
+)
+def test_a_mistake_in_looking_at_an_agent_is_one_line(
+    arguments: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert says in line_of([arguments[0], "--algo", "knntd", *arguments[1:]], capsys)
+
+
+def test_a_mistake_is_traced_on_demand(tmp_path: Path) -> None:
+    arguments = ["--algo", "knntd", "--env", "MountainCar-v0", "-f", str(tmp_path), "-params", "gamma:2"]
+    with pytest.raises(CommandError, match="gamma") as error:
+        main(["--traceback", "train", *arguments])
+    assert isinstance(error.value.__cause__, ValueError)
+
+
+def test_what_goes_wrong_in_training_is_not_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fault of an environment or of this package is found by its traceback."""
+
+    def step(env: MountainCarEnv, action: int) -> Any:
+        raise ValueError("a fault of the environment")
+
+    monkeypatch.setattr(MountainCarEnv, "step", step)
+    with pytest.raises(ValueError, match="a fault of the environment"):
+        train(tmp_path, "knntd", "MountainCar-v0", "-n", 30, "--eval-freq", -1)
+
+
+def test_values_that_diverge_are_told_of_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def learn(model: KNNTD, *arguments: Any, **options: Any) -> KNNTD:
+        raise FloatingPointError("the action values have diverged: give a smaller learning_rate")
+
+    monkeypatch.setattr(KNNTD, "learn", learn)
+    argv = ["train", "--algo", "knntd", "--env", "MountainCar-v0", "-f", str(tmp_path)]
+    assert "the action values have diverged" in line_of(argv, capsys)
 
 
 def test_module_lists_its_commands() -> None:

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import rl_zoo3
 
-from sb3_knntd.cli import CommandError
+from sb3_knntd.cli import CommandError, make_env, reason_of
 from sb3_knntd.compare.configurations import FLOOR, Configuration, configuration, fits, label
 from sb3_knntd.compare.experiment import experiment, prepare
-from sb3_knntd.compare.report import Comparison, make_report
-from sb3_knntd.compare.results import Run, Task, make_groups
+from sb3_knntd.compare.report import make_report
+from sb3_knntd.compare.results import Comparison, Run, Task, make_groups
 from sb3_knntd.compare.run import run
 from sb3_knntd.files import replace_file
 from sb3_knntd.jobs import Backend, Job, Outcome, run_jobs, run_locally, usable_cores
@@ -105,8 +105,8 @@ def compare(
     """
     try:
         prepare(plan.packages)
-    except ImportError as error:
-        raise CommandError(f"--gym-packages: {error}") from error
+    except Exception as error:
+        raise CommandError(f"--gym-packages: {reason_of(error)}") from error
     check_plan(plan)
     algos = [*(algo for algo in dict.fromkeys(plan.algos) if algo != FLOOR), FLOOR]
     chosen = choose_configurations(plan, algos)
@@ -151,10 +151,7 @@ def check_plan(plan: Plan) -> None:
             if name not in rl_zoo3.ALGOS:
                 raise CommandError(f"{option}: there is no algorithm {name!r}, but {', '.join(sorted(known))}")
     for env in plan.envs:
-        try:
-            gym.make(env).close()
-        except gym.error.Error as error:
-            raise CommandError(f"--env: {env!r} cannot be made: {error}") from error
+        make_env(env).close()
     for env in plan.thresholds:
         if env not in plan.envs:
             raise CommandError(f"--threshold: {env!r} is not among {', '.join(plan.envs)}")

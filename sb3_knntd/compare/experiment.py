@@ -31,7 +31,7 @@ def prepare(packages: Sequence[str] = ()) -> None:
     Make all algorithms and environments known in this process.
 
     :param packages: modules that register further environments
-    :raises ModuleNotFoundError: if there is no such module
+    :raises Exception: whatever importing one of them does, ModuleNotFoundError if it is not there
     """
     register()
     rl_zoo3.ALGOS.update(RIVALS)

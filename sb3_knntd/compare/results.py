@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_knntd.compare.configurations import FLOOR
+from sb3_knntd.compare.configurations import FLOOR, Configuration
 
 
 class Run(NamedTuple):
@@ -140,3 +140,31 @@ def make_groups(tasks: Sequence[Task]) -> list[Group]:
     """
     algos = {task.env: tuple(task.runs) for task in tasks}
     return [Group([task for task in tasks if algos[task.env] == same], same) for same in dict.fromkeys(algos.values())]
+
+
+class Comparison(NamedTuple):
+    """
+    Everything that a report is about.
+
+    :param tasks: environments with their runs
+    :param groups: those with the same algorithms together
+    :param configurations: by environment and algorithm
+    :param command: what computed it
+    :param seeds: of the runs
+    :param steps: of each run
+    :param eval_points: evaluations of each run
+    :param eval_episodes: episodes of each evaluation
+    :param failures: by name of a run that failed, why
+    :param notes: what else the reader must know
+    """
+
+    tasks: Sequence[Task]
+    groups: Sequence[Group]
+    configurations: Mapping[tuple[str, str], Configuration]
+    command: str
+    seeds: Sequence[int]
+    steps: int
+    eval_points: int
+    eval_episodes: int
+    failures: Mapping[str, str]
+    notes: Sequence[str]

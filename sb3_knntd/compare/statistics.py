@@ -4,16 +4,23 @@ Point estimates and 95 % intervals over seeds, by rliable's stratified bootstrap
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple
+from statistics import median
+from typing import Any, NamedTuple
 
 import numpy as np
 from rliable import library, metrics
 from scipy.stats import trim_mean
 
+from sb3_knntd.compare.configurations import OURS
+from sb3_knntd.compare.results import Group, Task
+
 #: Resamples of a bootstrap.
 REPETITIONS = 2000
+#: Bytes in a megabyte and in a kilobyte.
+MB, KB = 1e6, 1e3
 #: With fewer seeds an interval says little of where the truth lies.
 FEWEST_SEEDS = 5
 
@@ -118,3 +125,82 @@ def _probability_of_improvement(first: np.ndarray, second: np.ndarray) -> float:
     # metrics.probability_of_improvement is this, by way of a rank test whose p-value is thrown away.
     differences = first[:, None, :] - second[None, :, :]
     return float(((differences > 0) + 0.5 * (differences == 0)).mean())
+
+
+def task_rows(task: Task) -> list[dict[str, Any]]:
+    """
+    :param task: an environment with its runs
+    :return: for each algorithm what was measured, medians over seeds unless the name says otherwise
+    """
+    final = curves({algo: task.returns(algo)[:, None, -1:] for algo in task.runs})
+    mean = curves({algo: task.returns(algo).mean(axis=1)[:, None, None] for algo in task.runs})
+    rows = []
+    for algo, runs in task.runs.items():
+        costs = [run.cost_to(task.threshold) if task.threshold is not None else (math.nan,) * 2 for run in runs]
+        rows.append(
+            {
+                "env": task.env,
+                "algo": algo,
+                "runs": len(runs),
+                "final_iqm": final[algo].value.item(),
+                "final_low": final[algo].low.item(),
+                "final_high": final[algo].high.item(),
+                "final_median": float(np.median([run.final_return for run in runs])),
+                "mean_iqm": mean[algo].value.item(),
+                "threshold": task.threshold,
+                "reached": sum(math.isfinite(steps) for steps, _ in costs),
+                "steps_to_threshold": median(steps for steps, _ in costs),
+                "seconds_to_threshold": median(seconds for _, seconds in costs),
+                "steps_per_second": median(run.steps_per_second for run in runs),
+                "cpu_share": median(run.cpu_share for run in runs),
+                "start_seconds": median(run.result["start_seconds"] for run in runs),
+                "peak_memory_mb": median(run.result["peak_memory"] / MB for run in runs),
+                "learning_memory_mb": median(
+                    (run.result["peak_memory"] - run.result["base_memory"]) / MB for run in runs
+                ),
+                "model_kb": median(run.result["model_size"] / KB for run in runs),
+            }
+        )
+    return rows
+
+
+class GroupStatistics(NamedTuple):
+    """
+    What is told over several environments, of final scores unless the name says otherwise.
+
+    :param aggregates: by algorithm
+    :param thresholds: scores at which the profiles stand, shape (n,)
+    :param profiles: by algorithm
+    :param improvements: by pair
+    :param shares: points of the curves, as shares of the training, shape (n_points,)
+    :param curves: by algorithm, of scores during training
+    """
+
+    aggregates: Mapping[str, Estimate]
+    thresholds: np.ndarray
+    profiles: Mapping[str, Estimate]
+    improvements: Mapping[tuple[str, str], Estimate]
+    shares: np.ndarray
+    curves: Mapping[str, Estimate]
+
+
+def group_statistics(group: Group) -> GroupStatistics:
+    """
+    :param group: environments with the same algorithms
+    :return: what is told of them together
+    """
+    scores = {algo: drawn for algo in group.algos if len(drawn := group.scores(algo))}
+    final = {algo: drawn[..., -1] for algo, drawn in scores.items()}
+    lowest = min(0.0, min(float(drawn.min()) for drawn in final.values()))
+    highest = max(1.0, max(float(drawn.max()) for drawn in final.values()))
+    thresholds = np.linspace(max(lowest, -1.0), highest * 1.02, 121)
+    firsts = [algo for algo in final if algo in OURS] or list(final)[:1]
+    n_points = next(iter(scores.values())).shape[-1]
+    return GroupStatistics(
+        aggregates(final),
+        thresholds,
+        profiles(final, thresholds),
+        improvements(final, firsts),
+        np.arange(1, n_points + 1) / n_points,
+        curves(scores),
+    )

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from sb3_knntd.checks import check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
 from sb3_knntd.filters.table import Arguments, DeltaTable
@@ -81,6 +82,7 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
         training: bool = True,
         compiled: bool = True,
     ) -> None:
+        training = check_flag("training", training)
         arguments = Arguments(
             learning_rate=learning_rate,
             update=update,
@@ -164,14 +166,17 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
         save_table(path, self.table, self.training)
 
     @classmethod
-    def load(cls, path: str | pathlib.Path, env: gym.Env[np.ndarray, Any]) -> DeltaFilter:
+    def load(cls, path: str | pathlib.Path, env: gym.Env[np.ndarray, Any], trusted: bool = False) -> DeltaFilter:
         """
         :param path: file that a :class:`DeltaFilter` or a :class:`VecDeltaFilter` has saved
         :param env: the environment to filter
+        :param trusted: whether to unpickle functions that the file holds (``weights``, ``learning_rate``), which
+            is to run what it says
         :return: the filter as it was
-        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``env`` has
+        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``env`` has;
+            without trust also if it holds functions
         """
-        return cls._around(env, *load_table(path, env.observation_space, env.action_space))
+        return cls._around(env, *load_table(path, env.observation_space, env.action_space, trusted))
 
     @classmethod
     def _around(cls, env: gym.Env[np.ndarray, Any], table: DeltaTable, training: bool) -> DeltaFilter:

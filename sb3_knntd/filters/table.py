@@ -11,17 +11,25 @@ from gymnasium import spaces
 
 from sb3_knntd.actions import make_action_columns
 from sb3_knntd.base import progress_remaining
-from sb3_knntd.checks import check_integer, check_number, check_schedule, check_word
+from sb3_knntd.checks import (
+    check_flag,
+    check_integer,
+    check_number,
+    check_numbers,
+    check_schedule,
+    check_size,
+    check_word,
+    shown,
+)
 from sb3_knntd.kernels.filter import ADAPTIVE, COUNT, FIXED, OF_UPDATE
 from sb3_knntd.perception import Perceiver, make_bounds, make_points, make_weights
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.perception.points import AUTO_POINTS_PER_DIMENSION, count_neighbors
 from sb3_knntd.perception.search import make_search
+from sb3_knntd.states import checked_integer, checked_points, checked_tensor
 
 #: ``points="auto"``: a lattice of about this many points, fewer than a learner's: each entry has to average noise.
 AUTO_POINTS = 2000
-#: The table may take so many bytes.
-LARGEST_TABLE = 2**32
 
 
 class Arguments(NamedTuple):
@@ -97,13 +105,11 @@ class DeltaTable:
             make_search(arguments.search, places, n_neighbors),
             make_weights(arguments.weights, arguments.bandwidth, n_neighbors),
         )
-        size = places.n_points * n_columns * (self.obs_dim + 1) * 8
-        if size > LARGEST_TABLE:
-            raise ValueError(
-                f"points: a table of {places.n_points:,} points and {n_columns:,} actions would take "
-                f"{size / 2**30:,.0f} GiB: give fewer points, 1 for dimensions that the changes do not depend on, or "
-                "fewer action_points"
-            )
+        check_size(
+            f"points: a table of {places.n_points:,} points and {n_columns:,} actions",
+            places.n_points * n_columns * (self.obs_dim + 1) * 8,
+            "give fewer points, 1 for dimensions that the changes do not depend on, or fewer action_points",
+        )
         #: expected changes, shape (n_points, n_columns, obs_dim), observation units
         self.deltas = np.zeros((places.n_points, n_columns, self.obs_dim))
         #: visits, each shared among the neighbours as they count, shape (n_points, n_columns)
@@ -135,8 +141,7 @@ class DeltaTable:
         if given.update is not None:
             check_word("update", given.update, ["averaging", "gradient"])
         check_number("warmup", given.warmup, 0.0)
-        if not isinstance(given.compiled, (bool, np.bool_)):
-            raise ValueError(f"compiled must be True or False; got {given.compiled!r}")
+        check_flag("compiled", given.compiled)
         self.averaging = counts if given.update is None else given.update == "averaging"
 
         self.gain, self.fixed_gain = OF_UPDATE, np.zeros(self.obs_dim)
@@ -159,14 +164,13 @@ class DeltaTable:
 
     def _check_gain(self, gain: Any) -> np.ndarray:
         try:
-            array = np.asarray(gain, dtype=np.float64)
-            fits = array.shape in ((), (self.obs_dim,)) and np.all((array > 0) & (array <= 1))
-        except (TypeError, ValueError):
-            fits = False
-        if isinstance(gain, bool) or not fits:
+            array = check_numbers("gain", gain)
+        except ValueError:
+            array = np.empty(0)
+        if array.shape not in ((), (self.obs_dim,)) or not np.all((array > 0) & (array <= 1)):
             raise ValueError(
                 f"gain must be 'adaptive', None, a number in (0, 1], or one for each of the {self.obs_dim} observation "
-                f"dimensions; got {gain!r}"
+                f"dimensions; got {shown(gain)}"
             )
         return np.broadcast_to(array, (self.obs_dim,)).copy()
 
@@ -269,8 +273,18 @@ class DeltaTable:
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """
         :param state_dict: of a table with the same spaces and arguments
+        :raises ValueError: if no such table can have returned it
         """
-        visited = state_dict["points"].numpy()
+        points = checked_points(state_dict, "points", len(self.deltas))
+        shape = (len(points), *self.visits.shape[1:])
+        checked_tensor(state_dict, "deltas", (*shape, self.obs_dim), th.float64)
+        checked_tensor(state_dict, "visits", shape, th.float64, 0.0)
+        checked_tensor(state_dict, "gains", (self.obs_dim,), th.float64, 0.0, 1.0)
+        checked_tensor(state_dict, "variances", (self.obs_dim,), th.float64)
+        checked_tensor(state_dict, "counts", (1,), th.float64, 0.0)
+        for name in ("n_measured", "n_steps"):
+            checked_integer(state_dict, name, 0, 2**62)
+        visited = points.numpy()
         self.deltas[:], self.visits[:] = 0.0, 0.0
         self.deltas[visited], self.visits[visited] = state_dict["deltas"].numpy(), state_dict["visits"].numpy()
         for name in ("gains", "variances", "counts"):

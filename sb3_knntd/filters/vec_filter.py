@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_knntd.checks import check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
 from sb3_knntd.filters.table import Arguments, DeltaTable
@@ -62,6 +63,7 @@ class VecDeltaFilter(VecEnvWrapper):
         training: bool = True,
         compiled: bool = True,
     ) -> None:
+        training = check_flag("training", training)
         arguments = Arguments(
             learning_rate=learning_rate,
             update=update,
@@ -178,14 +180,17 @@ class VecDeltaFilter(VecEnvWrapper):
         save_table(path, self.table, self.training)
 
     @classmethod
-    def load(cls, path: str | pathlib.Path, venv: VecEnv) -> VecDeltaFilter:
+    def load(cls, path: str | pathlib.Path, venv: VecEnv, trusted: bool = False) -> VecDeltaFilter:
         """
         :param path: file that a :class:`VecDeltaFilter` or a :class:`DeltaFilter` has saved
         :param venv: the environments to filter
+        :param trusted: whether to unpickle functions that the file holds (``weights``, ``learning_rate``), which
+            is to run what it says
         :return: the filter as it was
-        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``venv`` has
+        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``venv`` has;
+            without trust also if it holds functions
         """
-        return cls._around(venv, *load_table(path, venv.observation_space, venv.action_space))
+        return cls._around(venv, *load_table(path, venv.observation_space, venv.action_space, trusted))
 
     @classmethod
     def _around(cls, venv: VecEnv, table: DeltaTable, training: bool) -> VecDeltaFilter:

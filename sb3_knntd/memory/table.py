@@ -10,6 +10,8 @@ import torch as th
 from torch import nn
 
 from sb3_knntd.kernels.memory import find_rows, rehash
+from sb3_knntd.states import checked_points, checked_tensor
+from sb3_knntd.tracing import is_traced
 
 
 class Lender(Protocol):
@@ -68,6 +70,17 @@ class QTable(nn.Module, ABC):
     def _forget_lent(self) -> None:
         if self.lender is not None:
             self.lender.forget()
+
+    def train(self, mode: bool = True) -> QTable:
+        """
+        As in torch. It brings the table up to date besides: to be exported with its values, a policy is put in
+        evaluation mode first.
+
+        :param mode: whether to train
+        :return: the table
+        """
+        self.sync()
+        return super().train(mode)
 
     @abstractmethod
     def entries(self) -> th.Tensor:
@@ -188,9 +201,12 @@ class DenseTable(QTable):
         no_points, no_slots = np.empty(0, np.int64), np.empty((0, 2), np.int64)
         return self.values.numpy(), self.visited.numpy(), no_points, no_slots, self.initial_value
 
-    def _load_from_state_dict(self, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        # What is missing or has another shape torch tells of.
+        if prefix + "values" in state_dict:
+            checked_tensor(state_dict, prefix + "values", (None, None))
         self._forget_lent()
-        super()._load_from_state_dict(*args)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
 
 class HashedTable(QTable):
@@ -198,6 +214,7 @@ class HashedTable(QTable):
     A row for every point that has been learned at, made then; all others are worth the initial value. For
     lattices larger than memory. On the CPU only.
 
+    :param n_points: number of points that may get a row
     :param n_actions: number of columns
     :param initial_value: what every entry is at the start
     :param dtype: floating type of the entries
@@ -207,8 +224,9 @@ class HashedTable(QTable):
 
     row_points: th.Tensor
 
-    def __init__(self, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
+    def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
+        self.n_points = n_points
         self.register_buffer("values", th.empty((0, n_actions), dtype=dtype))
         self.register_buffer("row_points", th.empty(0, dtype=th.int64))
         self._resize(self.SMALLEST)
@@ -225,6 +243,12 @@ class HashedTable(QTable):
         return self.row_points[: self.n_visited]
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
+        if is_traced():
+            raise ValueError(
+                "a policy with a hashed table cannot be traced or exported: its rows are found by compiled code. Make "
+                "the model with policy_kwargs={'table': 'dense'}, and fewer points if it would not fit; predict works "
+                "with any"
+            )
         self.sync()
         found = np.empty(indices.numel(), np.int64)
         find_rows(indices.reshape(-1).numpy(), self._slots, found)
@@ -274,7 +298,8 @@ class HashedTable(QTable):
             destination[prefix + name] = destination[prefix + name][: self.n_visited].clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        self._refill(state_dict[prefix + "row_points"], state_dict[prefix + "values"])
+        points = checked_points(state_dict, prefix + "row_points", self.n_points)
+        self._refill(points, checked_tensor(state_dict, prefix + "values", (len(points), self.n_actions)))
         whole = {prefix + name: getattr(self, name).clone() for name in ("values", "row_points")}
         super()._load_from_state_dict({**state_dict, **whole}, prefix, *args)
 

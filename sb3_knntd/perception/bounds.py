@@ -9,6 +9,9 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
+from sb3_knntd.checks import check_numbers, shown
+from sb3_knntd.states import checked_tensor
+
 #: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
 LARGEST_SENSIBLE_BOUND = 1e10
 #: A range is widened by this share beyond what was seen, since a better policy sees more than a random one.
@@ -56,6 +59,8 @@ class Bounds(nn.Module):
         super().__init__()
         self.adaptive = adaptive
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        #: number of observation dimensions
+        self.obs_dim = len(low)
         sensible = (np.abs(low) <= LARGEST_SENSIBLE_BOUND) & (np.abs(high) <= LARGEST_SENSIBLE_BOUND) & (low < high)
         is_open = ~sensible | adaptive
         self.register_buffer("low", th.from_numpy(np.where(is_open, -1.0, low)))
@@ -66,10 +71,16 @@ class Bounds(nn.Module):
         self.register_buffer("seen_low", th.full_like(self.low, th.inf))
         self.register_buffer("seen_high", th.full_like(self.low, -th.inf))
 
-    @property
-    def obs_dim(self) -> int:
-        """Number of observation dimensions."""
-        return len(self.low)
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        # What is missing torch tells of.
+        if all(prefix + name in state_dict for name in self.state_dict()):
+            shape = (self.obs_dim,)
+            low, high = (checked_tensor(state_dict, prefix + name, shape) for name in ("low", "high"))
+            for name in ("seen_low", "seen_high"):
+                checked_tensor(state_dict, prefix + name, shape, finite=False)
+            if not (low < high).all() or not th.isfinite(high - low).all():
+                raise ValueError(f"{prefix}low must be below {prefix}high; got {low.tolist()} and {high.tolist()}")
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def is_open(self) -> bool:
@@ -133,11 +144,26 @@ class Bounds(nn.Module):
         return self.low + 0.5 * (scaled + 1.0) * (self.high - self.low)
 
 
+def count_states(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param observation_space: Discrete, or MultiDiscrete or MultiBinary of one axis
+    :return: the first state of each of its components and how many there are, each of shape (obs_dim,)
+    :raises TypeError: if it is of another kind
+    """
+    if isinstance(observation_space, spaces.Discrete):
+        return np.array([observation_space.start]), np.array([observation_space.n])
+    if isinstance(observation_space, spaces.MultiDiscrete):
+        return observation_space.start, observation_space.nvec
+    if isinstance(observation_space, spaces.MultiBinary):
+        return np.zeros(observation_space.shape, np.int64), np.full(observation_space.shape, 2)
+    raise TypeError(f"no states can be counted in {observation_space}")
+
+
 def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space: bool = True) -> Bounds:
     """
     :param bounds: ``None`` for the space's own, ``"adaptive"`` to follow the observations within the space's own, or
         a pair (low, high) of arrays of shape (obs_dim,) in observation units
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param from_space: whether the space tells the range; with VecNormalize around the environment it does
         not, and all dimensions are open unless ``bounds`` are given
     :return: the bounds
@@ -152,14 +178,16 @@ def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space
     if not isinstance(observation_space, spaces.Box):
         raise ValueError(
             f"bounds must be None for a {type(observation_space).__name__} observation space, whose states are "
-            f"the points; got {bounds!r}"
+            f"the points; got {shown(bounds)}"
         )
     if isinstance(bounds, str) and bounds == "adaptive":
         return Bounds(*((low, high) if from_space else unbounded), adaptive=True)
     try:
-        given_low, given_high = (np.asarray(bound, dtype=np.float64) for bound in bounds)
+        given_low, given_high = (check_numbers("bounds", bound) for bound in bounds)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"bounds must be None, 'adaptive', or a pair (low, high) of arrays; got {bounds!r}") from error
+        raise ValueError(
+            f"bounds must be None, 'adaptive', or a pair (low, high) of arrays of numbers; got {shown(bounds)}"
+        ) from error
     for name, given in (("low", given_low), ("high", given_high)):
         if given.shape != low.shape:
             raise ValueError(
@@ -182,12 +210,7 @@ def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space
 def _bounds_of(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
     if isinstance(observation_space, spaces.Box):
         return observation_space.low.astype(np.float64), observation_space.high.astype(np.float64)
-    if isinstance(observation_space, spaces.Discrete):
-        first, counts = np.array([observation_space.start]), np.array([observation_space.n])
-    elif isinstance(observation_space, spaces.MultiDiscrete):
-        first, counts = observation_space.start, observation_space.nvec
-    else:
-        raise TypeError(f"no bounds are defined for {observation_space}")
+    first, counts = count_states(observation_space)
     # A lattice has its only point in the middle; a dimension with a single state has it at that state.
     alone = (counts == 1).astype(np.float64)
     return first - alone, first + np.maximum(counts - 1, 1)

@@ -13,7 +13,9 @@ from sb3_knntd.kernels.perceive import FOUND, are_within
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.points import Lattice, Points
 from sb3_knntd.perception.search import Neighbors, Search
+from sb3_knntd.perception.search.base import nearest_by_tensors
 from sb3_knntd.perception.weights import KernelWeights, Weights
+from sb3_knntd.tracing import is_traced
 
 
 class Perception(NamedTuple):
@@ -144,7 +146,11 @@ class Perceiver(nn.Module):
         :param scaled: observations, shape (batch, obs_dim), scaled units
         :return: their perceptions
         """
-        indices, squared_distances = self.search.query(scaled)
+        if is_traced():
+            places = self.points.coordinates(self.bounds)
+            indices, squared_distances = nearest_by_tensors(scaled, places, self.search.n_neighbors)
+        else:
+            indices, squared_distances = self.search.query(scaled)
         weights = self.weights(squared_distances)
         return Perception(indices, weights / weights.sum(dim=1, keepdim=True))
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_knntd.checks import check_integer
-from sb3_knntd.perception.bounds import Bounds
+from sb3_knntd.checks import check_integer, check_numbers, check_size, shown
+from sb3_knntd.perception.bounds import Bounds, count_states
 
 #: ``points="auto"``: a lattice of about this many points in all, with at most so many in a dimension.
 AUTO_POINTS = 8000
@@ -54,15 +54,22 @@ class Lattice(Points):
                 f"points: a lattice can have up to 2^63 - 1 points; got {self.shape}, which are {self.n_points:.3g}. "
                 "Give fewer points a dimension, 1 for dimensions that matter little"
             )
+        # A search keeps them once more.
+        check_size(
+            f"points: the coordinates of a lattice of {self.shape} points",
+            2 * 8 * sum(self.shape),
+            "give fewer points a dimension, or map a dimension of so many states to fewer",
+        )
         self.axes = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in self.shape]
+        self._axes = [th.from_numpy(axis) for axis in self.axes]
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
         device = bounds.low.device
         rest = th.arange(self.n_points, device=device) if indices is None else indices
         columns = []
-        for axis in reversed(self.axes):
-            columns.append(th.from_numpy(axis).to(device)[rest % len(axis)])
-            rest = rest // len(axis)
+        for axis, count in zip(reversed(self._axes), reversed(self.shape), strict=True):
+            columns.append(axis.to(device)[rest % count])
+            rest = rest // count
         return th.stack(columns[::-1], dim=1)
 
 
@@ -74,11 +81,11 @@ class Scattered(Points):
     """
 
     def __init__(self, places: np.ndarray) -> None:
-        self.places = np.array(places, dtype=np.float64)
+        self.places = th.from_numpy(np.array(places, dtype=np.float64))
         self.n_points, self.obs_dim = self.places.shape
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
-        places = th.from_numpy(self.places).to(bounds.low.device)
+        places = self.places.to(bounds.low.device)
         return bounds.scale(places if indices is None else places[indices])
 
 
@@ -86,32 +93,32 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
     """
     :param points: ``"auto"``, an int (points in every dimension), one int a dimension, or an array of
         shape (n_points, obs_dim) in observation units
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
-    :return: the points; for Discrete and MultiDiscrete one a state
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
+    :return: the points; for all but a Box one a state
     :raises ValueError: if ``points`` does not fit the space
     """
-    if isinstance(observation_space, spaces.Discrete | spaces.MultiDiscrete):
+    if isinstance(observation_space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         if not (isinstance(points, str) and points == "auto"):
             raise ValueError(
                 f"points must be 'auto' for a {type(observation_space).__name__} observation space, which has one "
-                f"point a state; got {points!r}"
+                f"point a state; got {shown(points)}"
             )
-        return Lattice(np.atleast_1d(getattr(observation_space, "nvec", getattr(observation_space, "n", 0))).tolist())
+        return Lattice(count_states(observation_space)[1].tolist())
 
     assert observation_space.shape is not None
     obs_dim = observation_space.shape[0]
     if isinstance(points, str):
         if points != "auto":
-            raise ValueError(f"points must be 'auto', an int, one int a dimension, or an array; got {points!r}")
+            raise ValueError(f"points must be 'auto', an int, one int a dimension, or an array; got {shown(points)}")
         per_dimension = min(AUTO_POINTS_PER_DIMENSION, max(2, round(AUTO_POINTS ** (1 / obs_dim))))
         return Lattice((per_dimension,) * obs_dim)
 
     try:
         array = np.asarray(points)
-    except ValueError as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"points: scattered points must be an array of shape (n_points, {obs_dim}); got rows of different "
-            f"lengths: {points!r}"
+            f"points: scattered points must be an array of shape (n_points, {obs_dim}), with rows of one length; got "
+            f"{shown(points)}"
         ) from error
     if array.ndim == 0:
         return Lattice((check_integer("points", points, 1),) * obs_dim)
@@ -119,22 +126,23 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
         if len(array) != obs_dim:
             raise ValueError(
                 f"points: one int for each of the {obs_dim} observation dimensions is needed; got {len(array)}: "
-                f"{points!r} (scattered points are an array of shape (n_points, {obs_dim}))"
+                f"{shown(points)} (scattered points are an array of shape (n_points, {obs_dim}))"
             )
         return Lattice([check_integer("points", count, 1) for count in array.tolist()])
     if array.ndim != 2 or array.shape[1] != obs_dim or len(array) == 0:
         raise ValueError(
             f"points: scattered points must be an array of shape (n_points, {obs_dim}); got shape {array.shape}"
         )
-    if not np.issubdtype(array.dtype, np.number) or not np.all(np.isfinite(array)):
-        raise ValueError("points: scattered points must be finite numbers; got NaN, infinity or something else")
-    return Scattered(array)
+    places = check_numbers("points: finite places", array)
+    if not np.isfinite(places).all():
+        raise ValueError(f"points: scattered points must be finite numbers; got {shown(points)}")
+    return Scattered(places)
 
 
 def count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
     """
     :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for finite states
-    :param observation_space: Box of shape (obs_dim,), Discrete or MultiDiscrete
+    :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param n_points: number of points to choose from
     :param obs_dim: number of observation dimensions
     :return: k
@@ -143,7 +151,7 @@ def count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_po
     exact = not isinstance(observation_space, spaces.Box)
     if isinstance(n_neighbors, str):
         if n_neighbors != "auto":
-            raise ValueError(f"n_neighbors must be an integer >= 1, or 'auto'; got {n_neighbors!r}")
+            raise ValueError(f"n_neighbors must be an integer >= 1, or 'auto'; got {shown(n_neighbors)}")
         return 1 if exact else min(2 * obs_dim + 1, n_points)
     k = check_integer("n_neighbors", n_neighbors, 1)
     if exact and k != 1:

@@ -8,8 +8,9 @@ from typing import Any, ClassVar, Protocol
 
 import torch as th
 
-from sb3_knntd.checks import check_number, check_word
+from sb3_knntd.checks import LEAST, check_number, check_word, shown
 from sb3_knntd.kernels.perceive import GAUSSIAN, INVERSE_QUADRATIC
+from sb3_knntd.tracing import is_traced
 
 
 class Weights(Protocol):
@@ -74,10 +75,12 @@ class Custom:
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
         answer = self.function(squared_distances)
+        if is_traced():
+            return self._recorded(answer)
         try:
             weights = th.as_tensor(answer, dtype=th.float64, device=squared_distances.device)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"weights: the function must return an array of numbers; got {answer!r}") from error
+            raise ValueError(f"weights: the function must return an array of numbers; got {shown(answer)}") from error
         if weights.shape != squared_distances.shape:
             raise ValueError(
                 f"weights: the function must return an array of the shape it is given, "
@@ -91,6 +94,16 @@ class Custom:
             )
         return weights
 
+    @staticmethod
+    def _recorded(answer: Any) -> th.Tensor:
+        """What values there will be is not known while torch records how to compute them."""
+        if not isinstance(answer, th.Tensor):
+            raise ValueError(
+                "a policy can be traced or exported if its weights are named ('inverse_quadratic', 'gaussian') or a "
+                f"function of torch operations; this one returned {type(answer).__name__}. predict works with any"
+            )
+        return answer.double()
+
 
 _BUILT_IN: dict[str, type[KernelWeights]] = {"inverse_quadratic": InverseQuadratic, "gaussian": Gaussian}
 
@@ -102,10 +115,10 @@ def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
     :param bandwidth: h, scaled units; has no meaning for a function
     :param n_neighbors: k, for the trial of a function
     :return: the weights
-    :raises ValueError: if the word is unknown, h is not positive, or the function returns NaN, infinity,
+    :raises ValueError: if the word is unknown, h is less than 1e-100, or the function raises, or returns NaN, infinity,
         negative or all-zero weights for distances as they occur
     """
-    check_number("bandwidth", bandwidth, 0.0, above=True)
+    bandwidth = check_number("bandwidth", bandwidth, LEAST)
     if not callable(weights):
         check_word("weights", weights, _BUILT_IN)
         return _BUILT_IN[weights](bandwidth)
@@ -114,7 +127,16 @@ def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
     # neighbours, so that a function that mixes up the two axes is found out.
     reach = th.linspace(0.0, 1.0, n_neighbors, dtype=th.float64)
     scales, offsets = th.linspace(0.0, 4.0, n_neighbors + 2), th.linspace(0.0, 12.0, n_neighbors + 2)
-    custom(scales[:, None].double() * reach + offsets[:, None].double())
+    distances = scales[:, None].double() * reach + offsets[:, None].double()
+    try:
+        custom(distances)
+    except ValueError:
+        raise
+    except Exception as error:
+        raise ValueError(
+            f"weights must be {', '.join(map(repr, _BUILT_IN))} or a function of squared distances (batch, k); got "
+            f"{shown(weights)}, which raised {type(error).__name__}: {error}"
+        ) from error
     return custom
 
 

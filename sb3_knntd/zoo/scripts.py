@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import runpy
 import sys
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 
 class Script(NamedTuple):
@@ -79,12 +81,38 @@ def run(name: str, arguments: Sequence[str]) -> None:
     called_with = sys.argv
     sys.argv = [f"sb3-knntd {name}", *(_folder_names(arguments) if script.by_folder else arguments)]
     try:
-        if script.function is None:
-            runpy.run_module(script.module, run_name="__main__")
-        else:
-            getattr(importlib.import_module(script.module), script.function)()
+        with _errors_in_one_line():
+            if script.function is None:
+                runpy.run_module(script.module, run_name="__main__")
+            else:
+                getattr(importlib.import_module(script.module), script.function)()
     finally:
         sys.argv = called_with
+
+
+@contextmanager
+def _errors_in_one_line() -> Iterator[None]:
+    """RL Zoo's parsers report mistakes as this package's do, and also those in NAME:VALUE, which they evaluate."""
+    from rl_zoo3.utils import StoreDict
+
+    from sb3_knntd.cli import Parser
+
+    report, store = argparse.ArgumentParser.error, StoreDict.__call__
+
+    def store_or_report(action: Any, parser: Any, namespace: Any, values: Sequence[str], *option: Any) -> None:
+        try:
+            store(action, parser, namespace, values, *option)
+        except Exception as error:
+            form = "NAME:VALUE, the value as Python has it (gamma:0.9, weights:\"'gaussian'\")"
+            raise argparse.ArgumentError(action, f"must be {form}; got {' '.join(values)}: {error}") from error
+
+    argparse.ArgumentParser.error = Parser.error  # type: ignore[assignment,method-assign]
+    StoreDict.__call__ = store_or_report  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        argparse.ArgumentParser.error = report  # type: ignore[method-assign]
+        StoreDict.__call__ = store  # type: ignore[method-assign]
 
 
 def _folder_names(arguments: Sequence[str]) -> list[str]:

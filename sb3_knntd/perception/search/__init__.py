@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_knntd.checks import check_word
+from sb3_knntd.checks import check_size, check_word
 from sb3_knntd.kernels import jit
 from sb3_knntd.perception.points import Lattice, Points
 from sb3_knntd.perception.search.base import Neighbors, Search
@@ -43,7 +43,15 @@ def make_search(search: str, points: Points, n_neighbors: int) -> Search:
     :raises ImportError: if the search needs a library that is not installed
     """
     check_word("search", search, ["auto", *SEARCHES])
-    return SEARCHES[choose_search(points) if search == "auto" else search](points, n_neighbors)
+    kind = SEARCHES[choose_search(points) if search == "auto" else search]
+    if isinstance(points, Lattice) and kind is not LatticeSearch:
+        # Each point has its place, once while they are put together and once in the order that the search needs.
+        check_size(
+            f"search={search!r}: a list of {points.n_points} points",
+            3 * 8 * points.n_points * points.obs_dim,
+            "use 'lattice' or 'auto', or give fewer points",
+        )
+    return kind(points, n_neighbors)
 
 
 def choose_search(points: Points) -> str:

@@ -1,0 +1,96 @@
+"""Whether a state from a file can have been saved by what is to take it over: compiled code looks at no bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+
+
+def checked_tensor(
+    state: Any,
+    name: str,
+    shape: Sequence[int | None],
+    dtype: th.dtype | None = None,
+    low: float = -np.inf,
+    high: float = np.inf,
+    finite: bool = True,
+) -> th.Tensor:
+    """
+    :param state: a state dict
+    :param name: which of its tensors
+    :param shape: what its shape must be, ``None`` for any size
+    :param dtype: what its type must be, ``None`` for any floating type
+    :param low: its smallest value
+    :param high: its largest value
+    :param finite: whether all its values must be finite
+    :return: the tensor
+    :raises ValueError: if there is none, or it is another; the message says in what
+    """
+    value = entry(state, name)
+    if not isinstance(value, th.Tensor) or value.layout != th.strided or value.is_meta:
+        raise ValueError(f"{name} must be a tensor; got {str(value)[:100]}")
+    sizes = tuple(value.shape)
+    if len(sizes) != len(shape) or any(want not in (None, size) for size, want in zip(sizes, shape, strict=True)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} must have shape ({wanted}); got {sizes}")
+    if value.dtype != dtype if dtype else not value.is_floating_point():
+        raise ValueError(f"{name} must be of type {dtype or 'float'}; got {value.dtype}")
+    # A file can say that all of a tensor is one number, and have a small file fill the memory when it is copied.
+    if value.untyped_storage().nbytes() < value.numel() * value.element_size():
+        raise ValueError(f"{name} has shape {sizes}, and fewer numbers than that")
+    if value.numel():
+        smallest, largest = (float(edge) for edge in value.aminmax())
+        # Not a number is neither below nor above.
+        if not (low <= smallest and largest <= high) or (finite and not (np.isfinite([smallest, largest]).all())):
+            raise ValueError(
+                f"{name} must be {'finite and ' if finite else ''}within [{low:g}, {high:g}]; got values "
+                f"from {smallest:g} to {largest:g}"
+            )
+    return value
+
+
+def checked_points(state: Any, name: str, n_points: int) -> th.Tensor:
+    """
+    :param state: a state dict
+    :param name: which of its tensors
+    :param n_points: number of points there are
+    :return: the tensor, numbers of points
+    :raises ValueError: if it is none, or names a point twice, or one that does not exist
+    """
+    points = checked_tensor(state, name, (None,), th.int64)
+    # Whole numbers: floats do not tell the largest apart.
+    if len(points) and (int(points.min()) < 0 or int(points.max()) >= n_points):
+        raise ValueError(f"{name} must be within [0, {n_points - 1}]; got {int(points.min())} to {int(points.max())}")
+    if len(points.unique()) < len(points):
+        raise ValueError(f"{name} must differ; some point is there twice")
+    return points
+
+
+def checked_integer(state: Any, name: str, low: int, high: int) -> int:
+    """
+    :param state: a state dict
+    :param name: which of its numbers
+    :param low: its smallest value
+    :param high: its largest value
+    :return: the number
+    :raises ValueError: if it is none, or another
+    """
+    value = entry(state, name)
+    if type(value) is not int or not low <= value <= high:
+        raise ValueError(f"{name} must be an integer within [{low}, {high}]; got {str(value)[:100]}")
+    return value
+
+
+def entry(state: Any, name: str) -> Any:
+    """
+    :param state: a state dict
+    :param name: which of its entries
+    :return: the entry
+    :raises ValueError: if there is none
+    """
+    if not isinstance(state, Mapping) or name not in state:
+        raise ValueError(f"there is no {name} in the state {str(state)[:100]}")
+    return state[name]

@@ -1,0 +1,131 @@
+"""A policy as torch's own formats have it: what is traced or exported acts as ``predict`` does."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from toy_envs import DriftEnv, PushEnv
+
+from sb3_knntd import KNNTD, ExA
+from sb3_knntd.kernels import jit
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning"),
+    pytest.mark.filterwarnings("error::torch.jit.TracerWarning"),
+]
+
+SCATTERED = np.random.default_rng(5).uniform(DriftEnv.LOW, DriftEnv.HIGH, size=(300, 2))
+ROUND_PLACES = np.round(SCATTERED, 1)  # many of the points are in the same place, and tie
+
+CONFIGURATIONS: dict[str, dict[str, Any]] = {
+    "defaults": {},
+    "brute lattice": {"points": (9, 7), "search": "brute"},
+    "brute": {"points": SCATTERED, "search": "brute"},
+    "kd_tree": {"points": SCATTERED, "search": "kd_tree"},
+    "ties": {"points": ROUND_PLACES, "search": "kd_tree", "n_neighbors": 6},
+    "gaussian": {"weights": "gaussian", "bandwidth": 0.3},
+    "function": {"weights": lambda d2: 1.0 / (0.1 + d2)},
+    "float32": {"policy_kwargs": {"dtype": th.float32}},
+    "torch": {"policy_kwargs": {"compiled": False}},
+}
+
+
+def make_model(algorithm: type[KNNTD | ExA], **arguments: Any) -> KNNTD | ExA:
+    env = PushEnv(dtype=np.float32) if algorithm is ExA else DriftEnv()
+    return algorithm(env, **{"bounds": (DriftEnv.LOW, DriftEnv.HIGH), "seed": 0, **arguments})
+
+
+def traced(policy: Any, example: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
+    # As it is taken elsewhere, in a file.
+    file = io.BytesIO()
+    th.jit.save(th.jit.trace(policy.eval(), example), file)
+    file.seek(0)
+    return th.jit.load(file)  # type: ignore[no-any-return]
+
+
+def exported(policy: Any, example: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
+    shapes = ({0: th.export.Dim("batch", min=1)}, None)
+    return th.export.export(policy.eval(), (example, True), dynamic_shapes=shapes).module()  # type: ignore[return-value]
+
+
+@pytest.fixture
+def places() -> np.ndarray:
+    """Two thousand observations within the bounds and beyond them, and some on points and halfway between them."""
+    width = DriftEnv.HIGH - DriftEnv.LOW
+    random = np.random.default_rng(7).uniform(DriftEnv.LOW - 0.3 * width, DriftEnv.HIGH + 0.3 * width, size=(2_000, 2))
+    on_lattice = DriftEnv.LOW + width * np.random.default_rng(8).integers(0, 17, size=(200, 2)) / 16
+    return np.concatenate((random, on_lattice)).astype(np.float32)
+
+
+@pytest.mark.parametrize("algorithm", [KNNTD, ExA])
+@pytest.mark.parametrize("how", [traced, exported])
+@pytest.mark.parametrize("name", CONFIGURATIONS)
+def test_it_acts_as_predict_does(
+    algorithm: type[KNNTD | ExA], how: Callable[..., Any], name: str, places: np.ndarray
+) -> None:
+    # In the middle of an episode: what was learned last is in it as well.
+    model = make_model(algorithm, **CONFIGURATIONS[name]).learn(1_003)
+    policy = how(model.policy, th.from_numpy(places[:2]))
+    expected, _ = model.predict(places, deterministic=True)
+    assert len(np.unique(expected)) > 1, "a constant policy would make this test empty"
+    with th.no_grad():
+        arguments = () if how is traced else (True,)
+        together = policy(th.from_numpy(places), *arguments).numpy()
+        alone = policy(th.from_numpy(places[:1]), *arguments).numpy()
+    assert together.dtype == expected.dtype
+    np.testing.assert_array_equal(together, expected)
+    np.testing.assert_array_equal(alone, expected[:1])
+
+
+def test_actions_that_do_not_start_at_0_and_whole_ones(places: np.ndarray) -> None:
+    class FromFive(DriftEnv):
+        def __init__(self) -> None:
+            super().__init__()
+            self.action_space = spaces.Discrete(3, start=5)
+
+        def step(self, action: Any) -> Any:
+            return super().step(action - 5)
+
+    models = [
+        KNNTD(FromFive(), points=(9, 7), seed=0),
+        ExA(PushEnv(low=-3, high=4, dtype=np.int32), points=(9, 7), seed=0),
+        ExA(PushEnv(shape=(2, 1)), action_points=(2, 3), action_table="factored", points=(9, 7), seed=0),
+    ]
+    for model in models:
+        model.learn(2_000)
+        expected, _ = model.predict(places, deterministic=True)
+        assert len(np.unique(expected)) > 1
+        actions = traced(model.policy, th.from_numpy(places[:3]))(th.from_numpy(places))
+        # Sums of doubles may differ in their last digit.
+        np.testing.assert_allclose(actions.numpy(), expected, rtol=0.0, atol=1e-15)
+        assert actions.numpy().dtype == expected.dtype
+
+
+@pytest.mark.skipif(not jit.AVAILABLE, reason="hashed tables need numba")
+@pytest.mark.parametrize("how", [traced, exported])
+def test_a_hashed_table_says_that_it_cannot_be(how: Callable[..., Any]) -> None:
+    model = make_model(KNNTD, policy_kwargs={"table": "hashed"}).learn(100)
+    with pytest.raises(ValueError, match=r"cannot be traced or exported.*policy_kwargs=\{'table': 'dense'\}"):
+        how(model.policy, th.zeros(2, 2))
+
+
+@pytest.mark.parametrize("how", [traced, exported])
+def test_weights_that_no_one_can_record_say_so(how: Callable[..., Any]) -> None:
+    model = make_model(KNNTD, points=(5, 5), weights=lambda d2: [[1.0] * d2.shape[1]] * d2.shape[0]).learn(100)
+    with pytest.raises(ValueError, match="function of torch operations"):
+        how(model.policy, th.zeros(2, 2))
+
+
+def test_what_is_traced_stays_as_it_was(places: np.ndarray) -> None:
+    model = make_model(KNNTD).learn(1_000)
+    expected, _ = model.predict(places, deterministic=True)
+    policy = traced(model.policy, th.from_numpy(places[:2]))
+    model.learn(3_000)
+    assert not np.array_equal(model.predict(places, deterministic=True)[0], expected)
+    np.testing.assert_array_equal(policy(th.from_numpy(places)).numpy(), expected)
