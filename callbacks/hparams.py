@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ class HParamCallback(PatientCallback):
 
     def __init__(self, metrics: Sequence[str] = METRICS, verbose: int = 0) -> None:
         super().__init__(check_verbose(verbose))
-        is_several = isinstance(metrics, Collection) and not isinstance(metrics, (str, bytes)) and len(metrics) > 0
+        is_several = isinstance(metrics, Sequence) and not isinstance(metrics, (str, bytes)) and len(metrics) > 0
         if not (is_several and all(isinstance(metric, str) for metric in metrics)):
             raise ValueError(f"metrics must be names of scalars, e.g. {METRICS[:2]}; got {shown(metrics)}")
         self.metrics = tuple(metrics)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -196,7 +197,10 @@ def in_bytes(number: int) -> str:
     :return: the same in the unit that it is easily read in
     """
     units = ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
-    power = min(max(number.bit_length() - 1, 0) // 10, len(units) - 1)
+    power = max(number.bit_length() - 1, 0) // 10
+    if power >= len(units):
+        # Combinations can be more than a float holds.
+        return f"{Decimal(number):.2e} bytes"
     return f"{number / 1024**power:,.4g} {units[power]}"
 
 
