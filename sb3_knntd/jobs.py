@@ -23,12 +23,16 @@ from multiprocessing.context import ForkServerContext, SpawnContext
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from filelock import FileLock, Timeout
+
 from sb3_knntd.files import replace_file
 
 #: What keeps a worker's libraries to one thread: with a worker a core, more would only wait for each other.
 ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR", "NUMBA")
 }
+#: What is locked in a folder where jobs are computed.
+LOCK = ".lock"
 #: How often a job is begun whose worker process dies.
 ATTEMPTS = 2
 #: Where there is no terminal, progress is told in so many lines, and when so many seconds have passed since the last.
@@ -43,11 +47,14 @@ class Job(NamedTuple):
     :param key: its name, and that of its file: letters, digits, ``_`` and ``-``
     :param function: what computes it, a function that can be imported by its name
     :param arguments: keyword arguments, of what JSON can hold
+    :param fits: whether something that is read from a file can be its result, a function that can be imported by its
+        name; by default anything can
     """
 
     key: str
     function: Callable[..., Any]
     arguments: Mapping[str, Any]
+    fits: Callable[[Any], bool] | None = None
 
 
 class Outcome(NamedTuple):
@@ -85,7 +92,7 @@ def run_jobs(
     :return: the outcome of each job, by key, in the order of ``jobs``
     :raises ValueError: if a key is no file name or there twice, or ``workers`` < 1
     :raises TypeError: if JSON cannot hold the arguments of a job
-    :raises OSError: if the folder cannot be written to
+    :raises OSError: if the folder cannot be written to, or another process computes there
     """
     if workers is not None and workers < 1:
         raise ValueError(f"workers must be at least 1; got {workers}")
@@ -93,11 +100,35 @@ def run_jobs(
     if len(descriptions) < len(jobs):
         raise ValueError(f"keys must differ; got {', '.join(job.key for job in jobs)}")
     folder.mkdir(parents=True, exist_ok=True)
+    with _alone_in(folder):
+        return _run_jobs(jobs, descriptions, folder, workers, title, backend)
 
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Nothing is computed twice; a lock of a process that is killed is gone."""
+    try:
+        with FileLock(folder / LOCK, blocking=False):
+            yield
+    except Timeout:
+        raise BlockingIOError(
+            f"another process computes in {folder}. Wait for it, and the same command goes on from there; or give "
+            "another folder"
+        ) from None
+
+
+def _run_jobs(
+    jobs: Sequence[Job],
+    descriptions: Mapping[str, dict[str, Any]],
+    folder: Path,
+    workers: int | None,
+    title: str,
+    backend: Backend | None,
+) -> dict[str, Outcome]:
     outcomes = {
-        key: outcome
-        for key, description in descriptions.items()
-        if (outcome := _stored_outcome(folder / f"{key}.json", description))
+        job.key: outcome
+        for job in jobs
+        if (outcome := _stored_outcome(folder / f"{job.key}.json", descriptions[job.key], job.fits))
     }
     missing = [job for job in jobs if job.key not in outcomes]
     events = run_locally(missing, workers or usable_cores()) if backend is None else backend(missing)
@@ -192,16 +223,24 @@ def _description(job: Job) -> dict[str, Any]:
     return description
 
 
-def _stored_outcome(path: Path, description: dict[str, Any]) -> Outcome | None:
+def _stored_outcome(path: Path, description: dict[str, Any], fits: Callable[[Any], bool] | None) -> Outcome | None:
     """The result in a file, if it is there and of just this job."""
     try:
         stored = json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError):
+    except FileNotFoundError:
         return None
-    if not isinstance(stored, dict) or "result" not in stored:
+    except (ValueError, RecursionError):
+        stored = None
+    if isinstance(stored, dict) and "error" in stored:
         return None
-    result = stored.pop("result")
-    return Outcome(result) if stored == description else None
+    if isinstance(stored, dict) and "result" in stored:
+        result = stored.pop("result")
+        if stored != description:
+            return None
+        if fits is None or fits(result):
+            return Outcome(result)
+    print(f"{path} is damaged, and its job is computed anew", file=sys.stderr)
+    return None
 
 
 def _new_worker(context: SpawnContext | ForkServerContext, lifeline: Connection) -> ProcessPoolExecutor:

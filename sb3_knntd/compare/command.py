@@ -20,7 +20,7 @@ from sb3_knntd.compare.configurations import FLOOR, Configuration, configuration
 from sb3_knntd.compare.experiment import experiment, prepare
 from sb3_knntd.compare.report import make_report
 from sb3_knntd.compare.results import Comparison, Run, Task, make_groups
-from sb3_knntd.compare.run import run
+from sb3_knntd.compare.run import is_result, run
 from sb3_knntd.files import replace_file
 from sb3_knntd.jobs import Backend, Job, Outcome, run_jobs, run_locally, usable_cores
 
@@ -205,7 +205,7 @@ def make_job(plan: Plan, env: str, algo: str, seed: int, hyperparams: Mapping[st
     }
     digest = hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()[:10]
     name = "".join(character if character.isalnum() or character in "_-" else "-" for character in env)
-    return Job(f"{name}-{algo}-{seed}-{digest}", run, arguments)
+    return Job(f"{name}-{algo}-{seed}-{digest}", run, arguments, is_result)
 
 
 def gather(

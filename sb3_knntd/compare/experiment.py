@@ -17,6 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_knntd.compare.expressions import as_data
 from sb3_knntd.compare.random_agent import RandomAgent
 from sb3_knntd.compare.sarsa import TileSarsa
 from sb3_knntd.zoo import register
@@ -68,8 +69,9 @@ class Experiment(KNNExperimentManager):
     def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
         """
         :return: the configuration that was given, to be preprocessed and to be stored
+        :raises ValueError: if it has in it what would have to be run
         """
-        hyperparams = copy.deepcopy(self._given) | {"n_timesteps": self.n_timesteps}
+        hyperparams = as_data(copy.deepcopy(self._given)) | {"n_timesteps": self.n_timesteps}
         self.eval_env_kwargs = hyperparams.get("env_kwargs", {})
         return hyperparams, OrderedDict(sorted(self._given.items()))
 

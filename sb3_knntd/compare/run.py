@@ -79,6 +79,26 @@ def run(
     }
 
 
+def is_result(result: Any) -> bool:
+    """
+    :param result: what a file says
+    :return: whether :func:`run` can have returned it
+    """
+    try:
+        points = [result[name] for name in ("steps", "returns", "stds", "seconds")]
+        numbers = [result[n] for n in ("cpu_seconds", "start_seconds", "base_memory", "peak_memory", "model_size")]
+        machine, packages = result["machine"], result["versions"]
+        return (
+            all(isinstance(part, list) and len(part) == len(points[0]) > 0 for part in points)
+            and all(type(number) in (int, float) for part in [numbers, *points] for number in part)
+            and all(number > 0 for number in [*result["steps"], *result["seconds"]])
+            and all(type(version) is str for version in packages.values())
+            and {"processor", "cores", "system"} <= set(machine)
+        )
+    except (TypeError, KeyError, AttributeError):
+        return False
+
+
 def saved_size(model: BaseAlgorithm) -> int:
     """
     :param model: any
