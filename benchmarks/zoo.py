@@ -6,8 +6,8 @@ The configurations of ``zoo_configs/`` beside RL Zoo's published figures.
 
 For each environment of ``knntd.yml`` and ``exa.yml`` an agent is trained with each seed, as ``sb3-knntd train`` does
 it, and then plays 100 greedy episodes in environments of its own. A run is kept in the folder and not done again until
-its configuration changes; after a change of the algorithms themselves, take another folder. What fails, for want of a
-simulator say, is told in the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
+its configuration changes; after a change of the algorithms themselves, take another folder. Failures, such as a missing
+simulator, are reported at the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
 """
 
 from __future__ import annotations

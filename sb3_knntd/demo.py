@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.cli import CommandError, make_env
+from sb3_knntd.compare.random_agent import RandomPolicy
 from sb3_knntd.exa import ExA
 from sb3_knntd.files import replacing
 from sb3_knntd.knntd import KNNTD
@@ -34,35 +35,6 @@ EVAL_ENVS = 20
 EVAL_STEP_LIMIT = 1000
 #: So that evaluation does not start where training did.
 EVAL_SEED_OFFSET = 1000
-
-
-class RandomPolicy:
-    """
-    Takes every action with the same probability, whatever it observes.
-
-    :param action_space: the actions
-    :param seed: seed of the choice
-    """
-
-    def __init__(self, action_space: spaces.Space[Any], seed: int) -> None:
-        self.action_space = action_space
-        self.action_space.seed(seed)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """
-        :param observation: shape (n_envs, *obs_shape)
-        :param state: handed through
-        :param episode_start: has no effect
-        :param deterministic: has no effect
-        :return: actions, shape (n_envs, *action_shape), and the state
-        """
-        return np.array([self.action_space.sample() for _ in range(len(observation))]), state
 
 
 class StopOnInterrupt:
@@ -143,7 +115,8 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
     )
     loaded = algorithm.load(files["model"], env=eval_env)
     learned = _evaluate(loaded, eval_env)
-    random = _evaluate(RandomPolicy(eval_env.action_space, seed), eval_env)
+    eval_env.action_space.seed(seed)
+    random = _evaluate(RandomPolicy(eval_env.observation_space, eval_env.action_space), eval_env)
     eval_env.close()
     print()
     _print_returns(f"Return on {env_id}", {name: learned, "random policy": random})

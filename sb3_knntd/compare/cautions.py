@@ -1,4 +1,4 @@
-"""What the reader of a report has to know before comparing numbers."""
+"""Warnings about results that do not compare well."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from sb3_knntd.compare.configurations import label
 from sb3_knntd.compare.results import Comparison
 from sb3_knntd.compare.statistics import FEWEST_SEEDS
 
-#: Below this share of a core, times tell more of the machine than of the algorithm.
+#: Below this share of a core, times depend more on the machine than on the algorithm.
 BUSY_SHARE = 0.8
 
 
 def cautions(comparison: Comparison) -> list[str]:
     """
     :param comparison: what is reported on
-    :return: what of it is to be read with care, a sentence or two each
+    :return: warnings for the reader, a sentence or two each
     """
     every = [run for task in comparison.tasks for runs in task.runs.values() for run in runs]
     words = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import io
 import json
 import math
@@ -36,6 +35,7 @@ from sb3_knntd.compare.statistics import (
     group_statistics,
     task_rows,
 )
+from sb3_knntd.csv_tables import csv_table
 from sb3_knntd.plots import DPI
 
 
@@ -80,8 +80,8 @@ def make_report(comparison: Comparison) -> dict[str, bytes]:
     rows = {task.env: task_rows(task) for task in comparison.tasks}
     statistics = [group_statistics(group) for group in comparison.groups]
     contents["report.html"] = _page(comparison, rows, statistics, contents).encode()
-    contents["summary.csv"] = _csv([row for task in comparison.tasks for row in rows[task.env]])
-    contents["curves.csv"] = _csv(list(_curve_rows(comparison.tasks)))
+    contents["summary.csv"] = _summary_csv(rows)
+    contents["curves.csv"] = _curves_csv(comparison.tasks)
     contents["report.json"] = json.dumps(_json(comparison, rows, statistics), indent=1, ensure_ascii=False).encode()
     return contents
 
@@ -218,29 +218,24 @@ def _distinct(values: Iterator[str]) -> list[str]:
     return list(dict.fromkeys(values))
 
 
-def _curve_rows(tasks: Sequence[Task]) -> Iterator[dict[str, Any]]:
-    for task in tasks:
-        for algo, runs in task.runs.items():
-            for run in runs:
-                columns = (run.result[name] for name in ("steps", "seconds", "returns", "stds"))
-                for steps, seconds, mean, std in zip(*columns, strict=True):
-                    yield {
-                        "env": task.env,
-                        "algo": algo,
-                        "seed": run.seed,
-                        "steps": steps,
-                        "seconds": round(seconds, 4),
-                        "return_mean": mean,
-                        "return_std": std,
-                    }
+def _summary_csv(rows: Mapping[str, Sequence[dict[str, Any]]]) -> bytes:
+    summary = [row for of_env in rows.values() for row in of_env]
+    return csv_table(list(summary[0]), (row.values() for row in summary))
 
 
-def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue().encode()
+def _curves_csv(tasks: Sequence[Task]) -> bytes:
+    return csv_table(
+        ("env", "algo", "seed", "steps", "seconds", "return_mean", "return_std"),
+        (
+            (task.env, algo, run.seed, steps, round(seconds, 4), mean, std)
+            for task in tasks
+            for algo, runs in task.runs.items()
+            for run in runs
+            for steps, seconds, mean, std in zip(
+                *(run.result[name] for name in ("steps", "seconds", "returns", "stds")), strict=True
+            )
+        ),
+    )
 
 
 def _json(

@@ -1,4 +1,4 @@
-"""The results of a comparison, and what of them can be told without statistics."""
+"""The results of a comparison, and the figures that need no resampling."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_knntd.compare.configurations import FLOOR, Configuration
 
 class Run(NamedTuple):
     """
-    What one seed came to.
+    The result of one seed.
 
     :param env: environment
     :param algo: name of the algorithm
@@ -60,7 +60,7 @@ class Task(NamedTuple):
 
     :param env: environment
     :param runs: by algorithm, one a seed; no algorithm without any
-    :param threshold: mean return that counts as having learned it, ``None`` if nobody says
+    :param threshold: mean return that counts as having learned it, ``None`` if unknown
     """
 
     env: str
@@ -104,7 +104,7 @@ class Task(NamedTuple):
         :return: mean returns, normalised, shape (n_runs, n_points)
         """
         span = self.top - self.floor
-        # If nobody is better than acting at random, nobody has a score.
+        # If no algorithm is better than acting at random, all scores are 0.
         return (self.returns(algo) - self.floor) / span if span > 0 else np.zeros_like(self.returns(algo))
 
 
@@ -122,7 +122,7 @@ class Group(NamedTuple):
     def scores(self, algo: str) -> np.ndarray:
         """
         :param algo: name of an algorithm
-        :return: normalised scores of the seeds that have come through on every environment, shape
+        :return: normalised scores of the seeds that succeeded on every environment, shape
             (n_runs, n_tasks, n_points)
         """
         by_seed = [
@@ -144,18 +144,18 @@ def make_groups(tasks: Sequence[Task]) -> list[Group]:
 
 class Comparison(NamedTuple):
     """
-    Everything that a report is about.
+    All that a report shows.
 
     :param tasks: environments with their runs
     :param groups: those with the same algorithms together
     :param configurations: by environment and algorithm
-    :param command: what computed it
+    :param command: the command line that computed it
     :param seeds: of the runs
     :param steps: of each run
     :param eval_points: evaluations of each run
     :param eval_episodes: episodes of each evaluation
-    :param failures: by name of a run that failed, why
-    :param notes: what else the reader must know
+    :param failures: by name of a failed run, its error
+    :param notes: further remarks for the reader
     """
 
     tasks: Sequence[Task]

@@ -21,10 +21,10 @@ from sb3_knntd.compare.results import Group, Task
 REPETITIONS = 2000
 #: Bytes in a megabyte and in a kilobyte.
 MB, KB = 1e6, 1e3
-#: With fewer seeds an interval says little of where the truth lies.
+#: With fewer seeds, intervals are unreliable.
 FEWEST_SEEDS = 5
 
-#: What is told of the final scores, and whether more is better.
+#: Aggregates of the final scores, by name.
 AGGREGATES: dict[str, Callable[[np.ndarray], float]] = {
     "IQM": metrics.aggregate_iqm,
     "median": metrics.aggregate_median,
@@ -48,7 +48,7 @@ class Estimate(NamedTuple):
 
 @contextmanager
 def fixed_seed() -> Iterator[None]:
-    """rliable resamples by NumPy's global generator: the same results get the same intervals."""
+    """Seed NumPy's global generator, from which rliable resamples, so that equal results get equal intervals."""
     state = np.random.get_state()
     np.random.seed(0)
     try:
@@ -61,7 +61,7 @@ def estimate(scores: Mapping[str, np.ndarray], function: Callable[[np.ndarray], 
     """
     :param scores: by algorithm, shape (n_runs, n_tasks, ...)
     :param function: from scores of that shape to shape (n,)
-    :return: by algorithm, what the function says, shape (n,)
+    :return: by algorithm, the value of the function and its interval, shape (n,)
     """
     with fixed_seed():
         values, intervals = library.get_interval_estimates(dict(scores), function, reps=REPETITIONS)
@@ -166,7 +166,7 @@ def task_rows(task: Task) -> list[dict[str, Any]]:
 
 class GroupStatistics(NamedTuple):
     """
-    What is told over several environments, of final scores unless the name says otherwise.
+    Statistics over several environments, of final scores unless the name says otherwise.
 
     :param aggregates: by algorithm
     :param thresholds: scores at which the profiles stand, shape (n,)
@@ -187,7 +187,7 @@ class GroupStatistics(NamedTuple):
 def group_statistics(group: Group) -> GroupStatistics:
     """
     :param group: environments with the same algorithms
-    :return: what is told of them together
+    :return: their statistics, over all of them together
     """
     scores = {algo: drawn for algo in group.algos if len(drawn := group.scores(algo))}
     final = {algo: drawn[..., -1] for algo, drawn in scores.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import sys
 import textwrap
@@ -10,10 +9,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from sb3_knntd.cli import CommandError
+from sb3_knntd.csv_tables import csv_table
 from sb3_knntd.files import replace_file
 from sb3_knntd.jobs import Job, run_jobs
 from sb3_knntd.reproduce import FIGURES
-from sb3_knntd.reproduce.figure import Table
 from sb3_knntd.reproduce.settings import load_settings
 from sb3_knntd.reproduce.statistics import seeds_range
 
@@ -75,7 +74,7 @@ def reproduce(name: str, best: bool, seeds: range, episodes: int | None, out: Pa
     title = f"Figure {name.removeprefix('fig')} with {of_whom}, {seeds_range(seeds)}"
     figure.draw(results, title).savefig(picture, format="png")
     contents = {
-        **{file: _csv(table) for file, table in figure.tables(results).items()},
+        **{file: csv_table(*table) for file, table in figure.tables(results).items()},
         "figure.png": picture.getvalue(),
         "verdict.txt": text.encode(),
     }
@@ -84,14 +83,6 @@ def reproduce(name: str, best: bool, seeds: range, episodes: int | None, out: Pa
     print(text)
     _print_paths(folder / file for file in contents)
     return 0
-
-
-def _csv(table: Table) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table.header)
-    writer.writerows(table.rows)
-    return text.getvalue().encode()
 
 
 def _print_paths(paths: Iterable[Path]) -> None:

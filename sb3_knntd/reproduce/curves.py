@@ -22,7 +22,7 @@ def episode_lengths(algorithm: str, setting: Setting, seed: int) -> list[int]:
     Learn for as many episodes as the setting says.
 
     :param algorithm: ``"knntd"`` or ``"exa"``
-    :param setting: as it stands in ``paper.yml``
+    :param setting: an entry of ``paper.yml``
     :param seed: seed of the model and its environment
     :return: steps of each episode
     """

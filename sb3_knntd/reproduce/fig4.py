@@ -83,7 +83,7 @@ def filtered_episodes(algorithm: str, setting: Setting, seed: int) -> dict[str, 
     Learn on filtered observations for as many episodes as the setting says, while the filter learns as well.
 
     :param algorithm: ``"knntd"``
-    :param setting: as it stands in ``paper.yml``
+    :param setting: an entry of ``paper.yml``
     :param seed: seed of the model, the environment and its problem
     :return: of each episode its ``steps`` and the root mean square error of the ``raw`` and the ``filtered`` signal,
         (n_episodes, 2); ``signals`` of the first and the last one, by their names, each (n_steps + 1, 2)

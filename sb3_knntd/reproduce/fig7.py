@@ -34,7 +34,7 @@ class FullEpisodeRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
 
     def __init__(self, env: gym.Env[np.ndarray, Any]) -> None:
         super().__init__(env)
-        #: Number of episodes that have come to their end.
+        #: Number of finished episodes.
         self.n_episodes = 0
         #: The states before each action and the actions, as shares of the largest force; None until there is one.
         self.recorded: tuple[list[list[float]], list[float]] | None = None
@@ -65,7 +65,7 @@ def first_full_episode(algorithm: str, setting: Setting, seed: int) -> dict[str,
     Learn until an episode lasts as long as it may, or for as many episodes as the setting says.
 
     :param algorithm: ``"knntd"`` or ``"exa"``
-    :param setting: as it stands in ``paper.yml``
+    :param setting: an entry of ``paper.yml``
     :param seed: seed of the model and its environment
     :return: ``episode``, counted from 1, ``None`` if there is none; its ``states`` (n_steps, 4) and ``actions``
         (n_steps,), shares of the largest force

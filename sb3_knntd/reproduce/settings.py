@@ -43,7 +43,7 @@ def make_model(
 ) -> KNNTD | ExA:
     """
     :param algorithm: ``"knntd"`` or ``"exa"``
-    :param setting: as it stands in ``paper.yml``
+    :param setting: an entry of ``paper.yml``
     :param seed: seed of the model and its environment
     :param wrap: puts wrappers around the environment
     :return: the model, to learn for :func:`total_steps`
@@ -62,7 +62,7 @@ def make_model(
 
 def total_steps(setting: Setting) -> int:
     """
-    :param setting: as it stands in ``paper.yml``
+    :param setting: an entry of ``paper.yml``
     :return: number of steps in its episodes if none ends before its time
     """
     most = gym.spec(setting["env"]).max_episode_steps

@@ -1,4 +1,4 @@
-"""Medians and intervals over seeds, and how they are told."""
+"""Medians and intervals over seeds, as numbers and as text."""
 
 from __future__ import annotations
 
