@@ -36,8 +36,8 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 
 from benchmarks.machine import describe
 from sb3_knntd import VecDeltaFilter
-from sb3_knntd.files import replace_file
-from sb3_knntd.jobs import Job, run_jobs
+from sb3_knntd.common.files import replace_file
+from sb3_knntd.distributed.jobs import Job, run_jobs
 from sb3_knntd.zoo import register
 from sb3_knntd.zoo.experiment import KNNExperimentManager
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.logger import HParam
 
-from sb3_knntd.audience import PatientCallback
-from sb3_knntd.checks import check_verbose, shown
+from sb3_knntd.common.callback_dispatcher import PatientCallback
+from sb3_knntd.common.checks import check_verbose, shown
 
 from .paced import picture_formats, write
 

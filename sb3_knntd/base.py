@@ -26,8 +26,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_knntd.audience import Audience
-from sb3_knntd.checks import (
+from sb3_knntd.actions.selection import ActionRule
+from sb3_knntd.common.callback_dispatcher import Audience
+from sb3_knntd.common.checks import (
     PROGRESS,
     check_flag,
     check_integer,
@@ -37,17 +38,16 @@ from sb3_knntd.checks import (
     check_word,
     shown,
 )
-from sb3_knntd.compiled_learner import CompiledLearner
-from sb3_knntd.files import read_description, replacing
+from sb3_knntd.common.files import read_description, replacing
+from sb3_knntd.common.plain import encodable, objects_for
+from sb3_knntd.common.random_stream import RandomStream
+from sb3_knntd.common.schedules import check_rate, make_schedule
 from sb3_knntd.kernels.step import UNDRAWN
-from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, check_finite, check_transition
-from sb3_knntd.memory import DenseTable
+from sb3_knntd.learners.base import Form, Learner, Rates, TorchLearner, check_finite, check_transition
+from sb3_knntd.learners.compiled import CompiledLearner
 from sb3_knntd.perception.bounds import steps_to_measure
-from sb3_knntd.plain import encodable, objects_for
 from sb3_knntd.policies import KNNPolicy
-from sb3_knntd.random_stream import RandomStream
-from sb3_knntd.rules import ActionRule
-from sb3_knntd.schedules import check_rate, make_schedule
+from sb3_knntd.q_table import DenseTable
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 

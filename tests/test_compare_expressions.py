@@ -15,8 +15,8 @@ from stable_baselines3 import HerReplayBuffer
 from torch import nn
 
 from sb3_knntd.cli import main
-from sb3_knntd.compare.expressions import EXPRESSIONS, as_data, evaluate
-from sb3_knntd.compare.run import is_result
+from sb3_knntd.experiments.compare.expressions import EXPRESSIONS, as_data, evaluate
+from sb3_knntd.experiments.compare.run import is_result
 
 
 @pytest.mark.parametrize(

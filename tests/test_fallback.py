@@ -50,7 +50,7 @@ with warnings.catch_warnings(record=True) as at_import:
     warnings.simplefilter("always")
     import test_fallback as shared
     from sb3_knntd import KNNTD
-from sb3_knntd.learner import TorchLearner
+from sb3_knntd.learners.base import TorchLearner
 import numpy as np
 
 folder = sys.argv[1]

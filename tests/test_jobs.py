@@ -16,15 +16,15 @@ from pathlib import Path
 import job_functions
 import pytest
 
-from sb3_knntd import jobs as jobs_module
-from sb3_knntd.files import replace_file
-from sb3_knntd.jobs import Job, Outcome, compute, run_jobs
+from sb3_knntd.common.files import replace_file
+from sb3_knntd.distributed import jobs as jobs_module
+from sb3_knntd.distributed.jobs import Job, Outcome, compute, run_jobs
 
 INTERRUPTIBLE = """
 import sys
 from pathlib import Path
 import job_functions
-from sb3_knntd.jobs import Job, run_jobs
+from sb3_knntd.distributed.jobs import Job, run_jobs
 if __name__ == "__main__":
     folder, pids, seconds = Path(sys.argv[1]), sys.argv[2], float(sys.argv[3])
     jobs = [Job("quick", job_functions.slow, {"seconds": 0, "folder": pids}),
@@ -266,7 +266,7 @@ import sys
 from pathlib import Path
 
 import job_functions
-from sb3_knntd.jobs import Job, run_jobs
+from sb3_knntd.distributed.jobs import Job, run_jobs
 
 if __name__ == "__main__":
     job = Job("dies", job_functions.die_while_answering, {"marker": sys.argv[1] + "/marker", "times": int(sys.argv[2])})

@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.checks import check_size, in_bytes
+from sb3_knntd.common.checks import check_size, in_bytes
 from sb3_knntd.filters import DeltaFilter
 
 

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Protocol
 
 import torch as th
 
-from sb3_knntd.checks import LEAST, check_number, check_word, shown
+from sb3_knntd.common.checks import LEAST, check_number, check_word, shown
+from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels.perceive import GAUSSIAN, INVERSE_QUADRATIC
-from sb3_knntd.tracing import is_traced
 
 
 class Weights(Protocol):
