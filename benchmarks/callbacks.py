@@ -29,7 +29,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from benchmarks.machine import describe
 from sb3_knntd import KNNTD
-from sb3_knntd.audience import Audience
+from sb3_knntd.common.callback_dispatcher import Audience
 
 ENV_ID = "MountainCar-v0"
 TOGETHER = "all five together"

@@ -1,6 +1,6 @@
 """
 The 2008 competition's generalised Mountain-Car: one configuration, that of ``zoo_configs/knntd.yml``, on many problems,
-whose offsets, noise and dynamics nobody tells the learner.
+whose offsets, noise and dynamics the learner does not know.
 
     python -m benchmarks.competition [--problems 30] [--first-problem 0] [--workers N] [--json FILE]
 

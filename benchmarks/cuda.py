@@ -11,10 +11,10 @@ import torch as th
 from gymnasium import spaces
 
 from benchmarks.rows import Row
-from sb3_knntd.exploration import EpsilonGreedy
-from sb3_knntd.learner import Form, TorchLearner
+from sb3_knntd.actions.exploration import EpsilonGreedy
+from sb3_knntd.actions.selection import DiscreteRule
+from sb3_knntd.learners.base import Form, TorchLearner
 from sb3_knntd.policies import KNNPolicy
-from sb3_knntd.rules import DiscreteRule
 
 N_ENVS, POINTS, K = 4096, 1000, 16
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_knntd.compare.machine import machine, versions
+from sb3_knntd.experiments.compare.machine import machine, versions
 
 PACKAGES = ("sb3-knntd", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
 

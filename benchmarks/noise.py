@@ -164,8 +164,8 @@ NARROW = CASES[1]._replace(ranges=(4.8, 6, 0.4189, 6), remark=" (range of its ep
 
 class KalmanFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """
-    What could be had: an extended Kalman filter that is told the dynamics and the noise. It is not told where the
-    controller keeps the state, which the table learns.
+    An extended Kalman filter that knows the dynamics and the noise. It does not know where the controller keeps the
+    state, which the table learns.
 
     :param env: noisy environment
     :param case: what is known of it

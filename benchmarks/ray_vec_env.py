@@ -20,7 +20,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from benchmarks.machine import describe
-from sb3_knntd.ray_vec_env import RayVecEnv
+from sb3_knntd.distributed.ray_vec_env import RayVecEnv
 
 
 class Slow(gym.Env[np.ndarray, Any]):

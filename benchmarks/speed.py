@@ -90,7 +90,7 @@ def steps_per_second(work: Callable[[int], Any], n_steps: int) -> float:
 
 
 def bare_loop(venv: VecEnv, n_steps: int) -> None:
-    """Random actions, drawn beforehand, in an environment that nobody learns from."""
+    """Random actions, drawn beforehand, in an environment, without learning."""
     random, space, size = np.random.default_rng(0), venv.action_space, (n_steps, venv.num_envs)
     if isinstance(space, spaces.Discrete):
         actions = random.integers(0, space.n, size)

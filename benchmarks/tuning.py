@@ -22,7 +22,7 @@ import optuna
 import yaml
 
 from benchmarks.zoo import ALGORITHMS, EPISODES, configurations, jobs
-from sb3_knntd.jobs import Job, run_jobs
+from sb3_knntd.distributed.jobs import Job, run_jobs
 from sb3_knntd.zoo import register
 from sb3_knntd.zoo.search_space import CONVERTERS
 

@@ -6,8 +6,8 @@ The configurations of ``zoo_configs/`` beside RL Zoo's published figures.
 
 For each environment of ``knntd.yml`` and ``exa.yml`` an agent is trained with each seed, as ``sb3-knntd train`` does
 it, and then plays 100 greedy episodes in environments of its own. A run is kept in the folder and not done again until
-its configuration changes; after a change of the algorithms themselves, take another folder. What fails, for want of a
-simulator say, is told in the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
+its configuration changes; after a change of the algorithms themselves, take another folder. Failures, such as a missing
+simulator, are reported at the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 
 from benchmarks.machine import describe
 from sb3_knntd import VecDeltaFilter
-from sb3_knntd.files import replace_file
-from sb3_knntd.jobs import Job, run_jobs
+from sb3_knntd.common.files import replace_file
+from sb3_knntd.distributed.jobs import Job, run_jobs
 from sb3_knntd.zoo import register
 from sb3_knntd.zoo.experiment import KNNExperimentManager
 

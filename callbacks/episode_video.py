@@ -11,8 +11,8 @@ import numpy as np
 from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_normalization
 
-from sb3_knntd.checks import check_integer, check_path, shown
-from sb3_knntd.files import replace_file
+from sb3_knntd.common.checks import check_integer, check_path, shown
+from sb3_knntd.common.files import replace_file
 
 from .paced import PacedCallback, picture_formats
 

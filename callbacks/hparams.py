@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.logger import HParam
 
-from sb3_knntd.audience import PatientCallback
-from sb3_knntd.checks import check_verbose, shown
+from sb3_knntd.common.callback_dispatcher import PatientCallback
+from sb3_knntd.common.checks import check_verbose, shown
 
 from .paced import picture_formats, write
 
@@ -40,7 +40,7 @@ class HParamCallback(PatientCallback):
 
     def __init__(self, metrics: Sequence[str] = METRICS, verbose: int = 0) -> None:
         super().__init__(check_verbose(verbose))
-        is_several = isinstance(metrics, Collection) and not isinstance(metrics, (str, bytes)) and len(metrics) > 0
+        is_several = isinstance(metrics, Sequence) and not isinstance(metrics, (str, bytes)) and len(metrics) > 0
         if not (is_several and all(isinstance(metric, str) for metric in metrics)):
             raise ValueError(f"metrics must be names of scalars, e.g. {METRICS[:2]}; got {shown(metrics)}")
         self.metrics = tuple(metrics)

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 from stable_baselines3.common.logger import CSVOutputFormat, HumanOutputFormat, JSONOutputFormat, KVWriter, Logger
 
-from sb3_knntd.audience import PatientCallback
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_integer, check_verbose
+from sb3_knntd.common.callback_dispatcher import PatientCallback
+from sb3_knntd.common.checks import check_integer, check_verbose
 
 #: ``freq=None``: calls between two looks at the clock.
 CALLS_BETWEEN_LOOKS = 128

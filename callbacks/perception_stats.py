@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_knntd.checks import check_integer
+from sb3_knntd.common.checks import check_integer
 from sb3_knntd.kernels.step import UNDRAWN
 
 from .paced import PacedCallback

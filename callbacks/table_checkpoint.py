@@ -19,9 +19,9 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_flag, check_integer, check_name, check_path
-from sb3_knntd.files import read_description, replacing, sweep
-from sb3_knntd.plain import class_name, loaded_class
+from sb3_knntd.common.checks import check_flag, check_integer, check_name, check_path
+from sb3_knntd.common.files import read_description, replacing, sweep
+from sb3_knntd.common.plain import class_name, loaded_class
 
 from .paced import PacedCallback
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from stable_baselines3.common.logger import Image
 
-from sb3_knntd.checks import check_flag, check_integer, check_path
-from sb3_knntd.files import replacing
+from sb3_knntd.common.checks import check_flag, check_integer, check_path
+from sb3_knntd.common.files import replacing
 from sb3_knntd.plots import (
     FINEST,
     Names,

@@ -4,7 +4,7 @@ an episode.
 
     python examples/noisy_sensors.py noisy_sensors.png
 
-The noise has a standard deviation of 3 % of the range of position and of velocity. The filter is told of neither noise
+The noise has a standard deviation of 3 % of the range of position and of velocity. The filter knows neither noise
 nor dynamics; it learns how the state changes while KNNTD learns what to do.
 """
 
@@ -33,7 +33,7 @@ def noisy_cars(n_envs: int, seed: int) -> VecEnv:
 
 def drive(model: KNNTD, venv: VecEnv) -> tuple[list[int], np.ndarray]:
     """
-    :param model: who drives
+    :param model: the trained model
     :param venv: one environment, filtered or not
     :return: number of steps of each of some episodes, and of all their steps what the model was told, what the sensors
         said, and the truth, shape (n_steps, 3, 2)

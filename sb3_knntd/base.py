@@ -26,8 +26,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_knntd.audience import Audience
-from sb3_knntd.checks import (
+from sb3_knntd.actions.selection import ActionRule
+from sb3_knntd.common.callback_dispatcher import Audience
+from sb3_knntd.common.checks import (
     PROGRESS,
     check_flag,
     check_integer,
@@ -37,17 +38,16 @@ from sb3_knntd.checks import (
     check_word,
     shown,
 )
-from sb3_knntd.compiled_learner import CompiledLearner
-from sb3_knntd.files import read_description, replacing
+from sb3_knntd.common.files import read_description, replacing
+from sb3_knntd.common.plain import encodable, objects_for
+from sb3_knntd.common.random_stream import RandomStream
+from sb3_knntd.common.schedules import check_rate, make_schedule
 from sb3_knntd.kernels.step import UNDRAWN
-from sb3_knntd.learner import Form, Learner, Rates, TorchLearner, check_finite, check_transition
-from sb3_knntd.memory import DenseTable
+from sb3_knntd.learners.base import Form, Learner, Rates, TorchLearner, check_finite, check_transition
+from sb3_knntd.learners.compiled import CompiledLearner
 from sb3_knntd.perception.bounds import steps_to_measure
-from sb3_knntd.plain import encodable, objects_for
 from sb3_knntd.policies import KNNPolicy
-from sb3_knntd.random_stream import RandomStream
-from sb3_knntd.rules import ActionRule
-from sb3_knntd.schedules import check_rate, make_schedule
+from sb3_knntd.q_table import DenseTable
 
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
@@ -173,17 +173,8 @@ class KNNAlgorithm(BaseAlgorithm):
         name = next(iter(cls.policy_aliases))
         default: type[KNNPolicy] = cls.policy_aliases[name]  # type: ignore[assignment]
         call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{name}", env)'
-        for given in (policy, env):
-            if isinstance(given, type) and issubclass(given, (gym.Env, gym.vector.VectorEnv, VecEnv)):
-                raise ValueError(
-                    f"env must be an environment; got the class {given.__name__}. Make one of it: "
-                    f"{cls.__name__}({given.__name__}(...))"
-                )
-            if isinstance(given, gym.vector.VectorEnv):
-                raise ValueError(
-                    f"{cls.__name__} takes SB3's VecEnv, and environments of gymnasium.vector are none; got {given!r}. "
-                    "In place of gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
-                )
+        cls._check_environment(policy)
+        cls._check_environment(env)
         if isinstance(policy, str) and policy in cls.policy_aliases:
             policy = cls.policy_aliases[policy]
         if isinstance(policy, str) and policy.endswith("Policy"):
@@ -201,6 +192,20 @@ class KNNAlgorithm(BaseAlgorithm):
         if env is not None:
             raise ValueError(f"two environments were given, {policy!r} and {env!r}. Call {call}")
         return default, policy
+
+    @classmethod
+    def _check_environment(cls, given: Any) -> None:
+        """Refuse what is near to an environment."""
+        if isinstance(given, type) and issubclass(given, (gym.Env, gym.vector.VectorEnv, VecEnv)):
+            raise ValueError(
+                f"env must be an environment; got the class {given.__name__}. Make one of it: "
+                f"{cls.__name__}({given.__name__}(...))"
+            )
+        if isinstance(given, gym.vector.VectorEnv):
+            raise ValueError(
+                f"{cls.__name__} takes SB3's VecEnv, and environments of gymnasium.vector are none; got {given!r}. In "
+                "place of gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
+            )
 
     @classmethod
     def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
@@ -305,9 +310,10 @@ class KNNAlgorithm(BaseAlgorithm):
 
         :param env: one of the same spaces, and as many if it is a VecEnv
         :param force_reset: whether ``learn`` starts new episodes
-        :raises ValueError: if its observations are normalised (VecNormalize) and those that the model was made for are
-            not, or the other way round; as in SB3, if its spaces differ
+        :raises ValueError: if it is a class or of gymnasium.vector; if its observations are normalised (VecNormalize)
+            and those that the model was made for are not, or the other way round; as in SB3, if its spaces differ
         """
+        self._check_environment(env)
         self._check_normalization(env)
         super().set_env(env, force_reset)
 
@@ -706,6 +712,7 @@ class KNNAlgorithm(BaseAlgorithm):
         :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has; without
             trust also if it holds functions or other objects that are there only as pickles
         """
+        cls._check_environment(env)
         saved = read_description(path)
         if saved.get("algorithm") != cls._algorithm:
             raise ValueError(

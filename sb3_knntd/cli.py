@@ -172,13 +172,13 @@ def _add_demo(subparsers: Subparsers) -> None:
 
 def _run_demo(args: argparse.Namespace) -> int:
     require("tqdm", "rich", "tensorboard", "matplotlib")
-    from sb3_knntd.demo import demo
+    from sb3_knntd.experiments.demo import demo
 
     return 0 if demo(args.env, args.steps, args.seed, args.out) else INTERRUPTED
 
 
 def _add_reproduce(subparsers: Subparsers) -> None:
-    from sb3_knntd.reproduce import FIGURES
+    from sb3_knntd.experiments.reproduce import FIGURES
 
     parser = subparsers.add_parser(
         "reproduce",
@@ -200,7 +200,7 @@ def _add_reproduce(subparsers: Subparsers) -> None:
 
 def _run_reproduce(args: argparse.Namespace) -> int:
     require("tqdm", "matplotlib", "yaml")
-    from sb3_knntd.reproduce.command import reproduce
+    from sb3_knntd.experiments.reproduce.command import reproduce
 
     seeds = _seeds(args)
     return _resumable(lambda: reproduce(args.figure, args.best, seeds, args.episodes, args.out, args.workers), args.out)
@@ -289,7 +289,7 @@ def _run_compare(args: argparse.Namespace) -> int:
     require("rl_zoo3", "rliable", "jinja2", "matplotlib", "tqdm", extra="compare")
     if args.backend == "ray":
         require("ray", extra="ray")
-    from sb3_knntd.compare.command import Plan, compare
+    from sb3_knntd.experiments.compare.command import Plan, compare
 
     plan = Plan(
         list(dict.fromkeys(args.env)),

@@ -11,10 +11,10 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_knntd.actions.selection import ActionRule, ContinuousRule
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_number, check_word, shown
+from sb3_knntd.common.checks import check_number, check_word, shown
 from sb3_knntd.policies import ExAPolicy
-from sb3_knntd.rules import ActionRule, ContinuousRule
 
 #: ``exploration_hold="auto"``: what share of an episode. A pole falls within fifty steps if something is tried for
 #: longer, and a car leaves no valley on less.

@@ -10,12 +10,12 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
+from sb3_knntd.actions.exploration import EXPLORATIONS
+from sb3_knntd.actions.selection import ActionRule, DiscreteRule
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import LEAST, check_word
-from sb3_knntd.exploration import EXPLORATIONS
+from sb3_knntd.common.checks import LEAST, check_word
+from sb3_knntd.common.schedules import check_rate, make_schedule
 from sb3_knntd.policies import KNNPolicy
-from sb3_knntd.rules import ActionRule, DiscreteRule
-from sb3_knntd.schedules import check_rate, make_schedule
 
 SelfKNNTD = TypeVar("SelfKNNTD", bound="KNNTD")
 

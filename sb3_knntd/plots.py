@@ -10,9 +10,9 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_knntd.actions.selection import mean_rows
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.checks import check_integer, check_number, shown
-from sb3_knntd.rules import mean_rows
+from sb3_knntd.common.checks import check_integer, check_number, shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

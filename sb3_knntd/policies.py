@@ -14,18 +14,18 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_knntd.actions import ActionColumns, make_action_columns
-from sb3_knntd.checks import check_flag, check_number, check_size, check_word, shown
-from sb3_knntd.exploration import greedy
+from sb3_knntd.actions.columns import ActionColumns, make_action_columns
+from sb3_knntd.actions.exploration import greedy
+from sb3_knntd.actions.selection import mean_actions, mean_rows
+from sb3_knntd.common.checks import check_flag, check_number, check_size, check_word, shown
+from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.step import best_entries
-from sb3_knntd.memory import DenseTable, HashedTable, QTable
 from sb3_knntd.perception import Lattice, Perceiver, Perception, Points, make_bounds, make_points, make_weights
 from sb3_knntd.perception.points import count_neighbors
 from sb3_knntd.perception.search import SEARCHES, make_search
 from sb3_knntd.perception.weights import KernelWeights
-from sb3_knntd.rules import mean_actions, mean_rows
-from sb3_knntd.tracing import is_traced
+from sb3_knntd.q_table import DenseTable, HashedTable, QTable
 
 #: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
 DENSE_TABLE_BYTES = 2**28

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -48,3 +49,18 @@ def slow(seconds: float, folder: str) -> int:
     Path(folder, f"started-{os.getpid()}").touch()
     time.sleep(seconds)
     return os.getpid()
+
+
+def die_while_answering(marker: str, times: int) -> str:
+    """Be killed so many times in the middle of a large answer, then return it."""
+    path = Path(marker)
+    attempts = int(path.read_text()) if path.exists() else 0
+    path.write_text(str(attempts + 1))
+    if attempts < times:
+        Connection._send = _send_half  # type: ignore[method-assign]
+    return "x" * 10**6
+
+
+def _send_half(connection: Connection, content: Any) -> None:
+    os.write(connection.fileno(), bytes(content)[: len(content) // 2])
+    os._exit(1)

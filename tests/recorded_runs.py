@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from toy_envs import EpisodeEnv
 
 from sb3_knntd import KNNTD, ExA, VecDeltaFilter
-from sb3_knntd.compare.sarsa import TileSarsa
+from sb3_knntd.experiments.baselines.tile_sarsa import TileSarsa
 
 DATA = Path(__file__).parent / "data"
 RECORDED = DATA / "recorded_tables.npz"

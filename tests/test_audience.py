@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Every
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd import KNNTD
-from sb3_knntd.audience import PatientCallback
+from sb3_knntd.common.callback_dispatcher import PatientCallback
 
 
 class Waiting(PatientCallback):

@@ -18,7 +18,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd import KNNTD, cli
-from sb3_knntd.jobs import Job, Outcome
+from sb3_knntd.distributed.jobs import Job, Outcome
 from sb3_knntd.zoo.schedules import with_schedules
 from sb3_knntd.zoo.search_space import SAMPLERS, attributes
 

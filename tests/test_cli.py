@@ -21,7 +21,7 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import load_results
 
 import sb3_knntd.cli
-import sb3_knntd.demo
+import sb3_knntd.experiments.demo
 from sb3_knntd import KNNTD, ExA
 from sb3_knntd.cli import CommandError, main
 
@@ -138,7 +138,7 @@ def test_the_table_is_that_of_the_saved_model(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: dict[str, np.ndarray] = {}
-    monkeypatch.setattr(sb3_knntd.demo, "_print_returns", lambda title, returns: shown.update(returns))
+    monkeypatch.setattr(sb3_knntd.experiments.demo, "_print_returns", lambda title, returns: shown.update(returns))
     assert main(["demo", "--env", "Corridor-v0", "--steps", "400", "--out", str(tmp_path)]) == 0
     assert len(shown["KNNTD"]) == len(shown["random policy"]) == 100
     # Four steps are the least; a policy that learned takes them in every episode.
@@ -182,7 +182,7 @@ def test_a_table_of_states_has_no_picture_of_values(tmp_path: Path, capsys: pyte
 def test_an_environment_without_end_is_evaluated_in_finite_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sb3_knntd.demo, "EVAL_STEP_LIMIT", 30)
+    monkeypatch.setattr(sb3_knntd.experiments.demo, "EVAL_STEP_LIMIT", 30)
     monkeypatch.setattr(KNNTD, "predict", lambda self, observation, **_: (np.zeros(len(observation), int), None))
     assert main(["demo", "--env", "Endless-v0", "--steps", "50", "--out", str(tmp_path)]) == 0
     output = capsys.readouterr().out

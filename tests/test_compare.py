@@ -28,15 +28,15 @@ from stable_baselines3.common.vec_env import VecNormalize
 import sb3_knntd.cli
 from sb3_knntd import KNNTD
 from sb3_knntd.cli import main
-from sb3_knntd.compare import statistics
-from sb3_knntd.compare.cautions import cautions
-from sb3_knntd.compare.configurations import Configuration, configuration, fits, label
-from sb3_knntd.compare.experiment import experiment, prepare
-from sb3_knntd.compare.report import make_report
-from sb3_knntd.compare.results import Comparison, Group, Run, Task, make_groups
-from sb3_knntd.compare.run import Recorder, run
-from sb3_knntd.compare.statistics import aggregates, curves, improvements, profiles, task_rows
-from sb3_knntd.jobs import Job, Outcome, run_jobs, run_locally
+from sb3_knntd.distributed.jobs import Job, Outcome, run_jobs, run_locally
+from sb3_knntd.experiments.compare import statistics
+from sb3_knntd.experiments.compare.cautions import cautions
+from sb3_knntd.experiments.compare.configurations import Configuration, configuration, fits, label
+from sb3_knntd.experiments.compare.experiment import experiment, prepare
+from sb3_knntd.experiments.compare.report import make_report
+from sb3_knntd.experiments.compare.results import Comparison, Group, Run, Task, make_groups
+from sb3_knntd.experiments.compare.run import Recorder, run
+from sb3_knntd.experiments.compare.statistics import aggregates, curves, improvements, profiles, task_rows
 
 CHROMIUM = Path("/usr/bin/chromium")
 TINY = ["--steps", "300", "--eval-points", "3", "--eval-episodes", "2", "--gym-packages", "compare_envs"]
@@ -522,7 +522,7 @@ def test_fresh_processes(tmp_path: Path) -> None:
         Job("threads", job_functions.threads, {}),
     ]
     events: list[tuple[str, Outcome | None]] = []
-    for job, outcome in run_locally(jobs, 2, fresh=True, preload=["sb3_knntd.jobs", "job_functions"]):
+    for job, outcome in run_locally(jobs, 2, fresh=True, preload=["sb3_knntd.distributed.jobs", "job_functions"]):
         events.append((job.key, outcome))
         running = {key for key, _ in events} - {key for key, found in events if found}
         assert len(running) <= 2
@@ -539,11 +539,11 @@ import sys
 from functools import partial
 from pathlib import Path
 import job_functions
-from sb3_knntd.jobs import Job, run_jobs, run_locally
+from sb3_knntd.distributed.jobs import Job, run_jobs, run_locally
 if __name__ == "__main__":
     folder, pids = Path(sys.argv[1]), sys.argv[2]
     jobs = [Job(f"{n}", job_functions.slow, {"seconds": 60 * n, "folder": pids}) for n in range(2)]
-    backend = partial(run_locally, workers=1, fresh=True, preload=["sb3_knntd.jobs", "job_functions"])
+    backend = partial(run_locally, workers=1, fresh=True, preload=["sb3_knntd.distributed.jobs", "job_functions"])
     run_jobs(jobs, folder, backend=backend)
 """
 

@@ -21,8 +21,8 @@ from ray.util.client.server.server import serve
 from ray_cluster import NODE, TESTS, loopback_cluster
 
 from sb3_knntd.cli import main
-from sb3_knntd.jobs import Job, run_jobs
-from sb3_knntd.ray_jobs import connected, run_on_ray
+from sb3_knntd.distributed.jobs import Job, run_jobs
+from sb3_knntd.distributed.ray_jobs import connected, run_on_ray
 
 
 @pytest.fixture(scope="module")

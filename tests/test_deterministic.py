@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.random_stream import RandomStream
+from sb3_knntd.common.random_stream import RandomStream
 
 Algorithm = type[KNNTD | ExA]
 MakeModel = Callable[..., KNNTD | ExA]

@@ -83,7 +83,7 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
     assert run.returncode == 0, run.stderr
 
 
-class ArgumentsReadError(Exception):
+class ArgumentsReadError(BaseException):
     """The arguments of a command have been read, and it is about to begin its work."""
 
 

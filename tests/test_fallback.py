@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ with warnings.catch_warnings(record=True) as at_import:
     warnings.simplefilter("always")
     import test_fallback as shared
     from sb3_knntd import KNNTD
-from sb3_knntd.learner import TorchLearner
+from sb3_knntd.learners.base import TorchLearner
 import numpy as np
 
 folder = sys.argv[1]
@@ -180,7 +181,84 @@ def test_numba_has_nowhere_to_keep_its_results(tmp_path: pathlib.Path) -> None:
         timeout=300,
     )
     assert run.returncode == 0, run.stderr[-1500:]
+    assert "compiled anew" in run.stderr
+    assert "has no folder for its cache" in run.stderr
     assert float(run.stdout) == pytest.approx(learn().policy.q_table.sum().item(), rel=1e-9)
+
+
+CACHED = """
+import sys, warnings
+warnings.simplefilter("always")
+import sb3_knntd.kernels.memory as memory
+import numpy as np
+slots = np.full((8, 2), -1, np.int64)
+memory.rehash(np.arange(3), 3, slots)
+found = np.empty(4, np.int64)
+memory.find_rows(np.arange(4), slots, found)
+print(found.tolist())
+"""
+
+
+def find_rows_with(cache: pathlib.Path) -> str:
+    """What is warned of when a few kernels are compiled with the cache in a folder."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    command = [sys.executable, "-c", CACHED]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0, run.stderr[-1500:]
+    assert run.stdout == "[0, 1, 2, -1]\n"
+    return run.stderr
+
+
+def cut(content: bytes) -> bytes:
+    """The first half."""
+    return content[: len(content) // 2]
+
+
+def flip(content: bytes) -> bytes:
+    """One bit in the middle is another."""
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """One that has been filled."""
+    folder = tmp_path_factory.mktemp("cache")
+    assert "compiled anew" not in find_rows_with(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("suffix", "damage"),
+    [(".nbi", cut), (".nbi", lambda _: b"garbage"), (".nbi", lambda _: b""), (".nbc", cut), (".nbc", flip)],
+    ids=["index cut", "index garbage", "index empty", "code cut", "code flipped"],
+)
+def test_a_damaged_cache_is_replaced(
+    cache: pathlib.Path, tmp_path: pathlib.Path, suffix: str, damage: Callable[[bytes], bytes]
+) -> None:
+    shutil.copytree(cache, tmp_path, dirs_exist_ok=True)
+    files = list(tmp_path.rglob(f"*{suffix}"))
+    assert files
+    for file in files:
+        file.write_bytes(damage(file.read_bytes()))
+    warned = find_rows_with(tmp_path)
+    assert warned.count("RuntimeWarning: the kernels are compiled anew") == 1
+    assert "cannot be read" in warned
+    assert "compiled anew" not in find_rows_with(tmp_path), "the next process finds it mended"
+
+
+def test_a_full_disk_keeps_no_kernel(tmp_path: pathlib.Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no file system can be mounted here")
+    try:
+        warned = find_rows_with(disk)
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+    assert warned.count("RuntimeWarning: the kernels are compiled anew") == 1
+    assert "No space left" in warned
 
 
 # ------------------------------------------------------------------------------------------ accelerators

@@ -27,8 +27,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from toy_envs import DriftEnv
 
 from sb3_knntd import KNNTD, DeltaFilter, ExA, VecDeltaFilter
-from sb3_knntd.files import replace_file
-from sb3_knntd.plain import decode, encode
+from sb3_knntd.common.files import replace_file
+from sb3_knntd.common.plain import decode, encode
 
 MakeModel = Callable[..., KNNTD | ExA]
 MakeVenv = Callable[..., VecEnv]
@@ -75,7 +75,7 @@ def test_a_name_can_be_as_long_as_the_file_system_takes(
 
 WRITE_AND_WAIT = """
 import sys, time
-from sb3_knntd.files import replacing
+from sb3_knntd.common.files import replacing
 with replacing(sys.argv[1]) as file:
     file.write(b"half")
     file.flush()

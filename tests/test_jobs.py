@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -15,15 +16,15 @@ from pathlib import Path
 import job_functions
 import pytest
 
-from sb3_knntd import jobs as jobs_module
-from sb3_knntd.files import replace_file
-from sb3_knntd.jobs import Job, Outcome, run_jobs
+from sb3_knntd.common.files import replace_file
+from sb3_knntd.distributed import jobs as jobs_module
+from sb3_knntd.distributed.jobs import Job, Outcome, compute, run_jobs
 
 INTERRUPTIBLE = """
 import sys
 from pathlib import Path
 import job_functions
-from sb3_knntd.jobs import Job, run_jobs
+from sb3_knntd.distributed.jobs import Job, run_jobs
 if __name__ == "__main__":
     folder, pids, seconds = Path(sys.argv[1]), sys.argv[2], float(sys.argv[3])
     jobs = [Job("quick", job_functions.slow, {"seconds": 0, "folder": pids}),
@@ -84,7 +85,7 @@ def test_each_is_computed_once_for_its_arguments(tmp_path: Path, capfd: pytest.C
     log.unlink()
     assert run_jobs(jobs, folder) == outcomes
     assert not log.exists()
-    assert sorted(path.name for path in folder.iterdir()) == [f"square-{n}.json" for n in (1, 2, 3, 4)]
+    assert sorted(path.name for path in folder.glob("*.json")) == [f"square-{n}.json" for n in (1, 2, 3, 4)]
 
 
 def test_what_fails_or_dies_does_not_sink_the_rest(
@@ -141,7 +142,7 @@ def test_interrupted_it_keeps_what_is_finished_and_goes_on(tmp_path: Path, blow:
     assert program.wait(20) == (130 if blow == signal.SIGINT else -blow)
     (worker,) = (int(path.name.split("-")[1]) for path in pids.iterdir())
     wait_until(lambda: not is_running(worker), 5)
-    assert [path.name for path in folder.iterdir()] == ["quick.json"]
+    assert [path.name for path in folder.glob("*.json")] == ["quick.json"]
 
     if blow == signal.SIGINT:
         first = (folder / "quick.json").read_text()
@@ -210,3 +211,81 @@ def test_a_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
     replace_file(path, b"new")
     assert path.read_bytes() == b"new"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_second_process_in_the_folder_says_so_and_computes_nothing(tmp_path: Path) -> None:
+    folder, pids, script = tmp_path / "jobs", tmp_path / "pids", tmp_path / "script.py"
+    pids.mkdir()
+    script.write_text(INTERRUPTIBLE)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    program = subprocess.Popen([sys.executable, str(script), str(folder), str(pids), "60"], env=environment)
+    try:
+        wait_until(lambda: (folder / "quick.json").exists())
+        with pytest.raises(BlockingIOError, match="another process computes in"):
+            run_jobs(squares([3], tmp_path / "log"), folder)
+        assert not (tmp_path / "log").exists()
+    finally:
+        program.kill()
+        program.wait()
+    # The lock of a killed process is gone.
+    assert run_jobs(squares([3], tmp_path / "log"), folder, workers=1)["square-3"].result["square"] == 9
+
+
+@pytest.mark.parametrize(
+    "content", [b"[]", b"{", b'{"result": 3}', b"[" * 100_000], ids=["list", "cut", "alone", "deep"]
+)
+def test_a_damaged_file_is_named_and_its_job_computed_anew(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], content: bytes
+) -> None:
+    jobs = squares([3], tmp_path / "log")
+    run_jobs(jobs, tmp_path / "jobs", workers=1)
+    path = tmp_path / "jobs" / "square-3.json"
+    path.write_bytes(content)
+    capfd.readouterr()
+    assert run_jobs(jobs, tmp_path / "jobs", workers=1)["square-3"].result["square"] == 9
+    told = capfd.readouterr().err
+    assert (f"{path} is damaged" in told) == (content != b'{"result": 3}'), "of another job is not damaged"
+
+
+def test_a_result_that_does_not_fit_is_named_and_computed_anew(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    jobs = [job._replace(fits=lambda result: "square" in result) for job in squares([3], tmp_path / "log")]
+    folder = tmp_path / "jobs"
+    run_jobs([job._replace(fits=None) for job in jobs], folder, workers=1)
+    stored = json.loads((folder / "square-3.json").read_text())
+    (folder / "square-3.json").write_text(json.dumps(stored | {"result": {"cube": 27}}))
+    capfd.readouterr()
+    outcomes = run_jobs(jobs, folder, backend=lambda missing: ((job, compute(job)) for job in missing))
+    assert outcomes["square-3"].result["square"] == 9
+    assert "square-3.json is damaged" in capfd.readouterr().err
+
+
+DYING = """
+import sys
+from pathlib import Path
+
+import job_functions
+from sb3_knntd.distributed.jobs import Job, run_jobs
+
+if __name__ == "__main__":
+    job = Job("dies", job_functions.die_while_answering, {"marker": sys.argv[1] + "/marker", "times": int(sys.argv[2])})
+    print(run_jobs([job], Path(sys.argv[1]) / "jobs", workers=1)["dies"].error or "alive")
+"""
+
+
+@pytest.mark.parametrize(("times", "said"), [(1, "alive"), (9, "its process died 2 times: killed, or short of memory")])
+def test_a_worker_that_dies_in_the_middle_of_a_large_answer_holds_nothing_up(
+    tmp_path: Path, times: int, said: str
+) -> None:
+    # As workers did at Ctrl-C: whoever waited for the other half waited for ever.
+    script = tmp_path / "script.py"
+    script.write_text(DYING)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, str(script), str(tmp_path), str(times)]
+    program = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        assert program.communicate(timeout=100)[0].strip() == said
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(program.pid, signal.SIGKILL)

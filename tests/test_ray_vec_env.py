@@ -39,7 +39,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_knntd import KNNTD, ExA, ray_vec_env
-from sb3_knntd.ray_vec_env import RayVecEnv
+from sb3_knntd.distributed.ray_vec_env import RayVecEnv
 
 #: Nothing is reserved: the tests' machine has few cores, and nobody else is on the cluster.
 SHARED: dict[str, Any] = {"num_cpus": 0}
@@ -496,13 +496,15 @@ def test_ray_is_imported_only_when_needed(monkeypatch: pytest.MonkeyPatch) -> No
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert printed == "False\n"
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "sb3_knntd.ray_vec_env")
+    monkeypatch.delitem(sys.modules, "sb3_knntd.distributed.ray_vec_env")
     with pytest.raises(ImportError, match=r"RayVecEnv needs Ray: pip install 'sb3-knntd\[ray\]'"):
-        importlib.import_module("sb3_knntd.ray_vec_env")
+        importlib.import_module("sb3_knntd.distributed.ray_vec_env")
 
 
 def test_given_no_cluster_it_starts_its_own(cluster: Cluster) -> None:
-    program = "import ray; from sb3_knntd.ray_jobs import connect; print(connect(), ray.cluster_resources())"
+    program = (
+        "import ray; from sb3_knntd.distributed.ray_jobs import connect; print(connect(), ray.cluster_resources())"
+    )
     environ = {key: value for key, value in os.environ.items() if key != "RAY_ADDRESS"}
     done = subprocess.run([sys.executable, "-c", program], env=environ, timeout=300, capture_output=True, text=True)
     assert done.stdout.startswith("True {"), done.stderr[-3000:]
@@ -512,7 +514,7 @@ def test_given_no_cluster_it_starts_its_own(cluster: Cluster) -> None:
 ELSEWHERE = """
 import sys, warnings, os, signal, numpy as np, ray
 from ray_envs import MortalEnv
-from sb3_knntd.ray_vec_env import RayVecEnv
+from sb3_knntd.distributed.ray_vec_env import RayVecEnv
 venv = RayVecEnv([MortalEnv] * 2, num_cpus=0, address=sys.argv[1])
 venv.reset()
 assert venv.step(np.zeros(2, int))[1].tolist() == [-1, -1]

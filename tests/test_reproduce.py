@@ -22,13 +22,13 @@ import pytest
 import sb3_knntd.cli
 from sb3_knntd import DeltaFilter
 from sb3_knntd.cli import main
-from sb3_knntd.reproduce import FIGURES
-from sb3_knntd.reproduce.curves import episode_lengths
-from sb3_knntd.reproduce.fig4 import SignalRecorder, at_wall, constant_error, ratio_off_wall
-from sb3_knntd.reproduce.fig6 import success
-from sb3_knntd.reproduce.fig7 import FullEpisodeRecorder, mean_change, used_share
-from sb3_knntd.reproduce.settings import ALGORITHMS, load_settings, make_model, total_steps
-from sb3_knntd.reproduce.statistics import interval, quantile
+from sb3_knntd.experiments.reproduce import FIGURES
+from sb3_knntd.experiments.reproduce.curves import episode_lengths
+from sb3_knntd.experiments.reproduce.fig4 import SignalRecorder, at_wall, constant_error, ratio_off_wall
+from sb3_knntd.experiments.reproduce.fig6 import success
+from sb3_knntd.experiments.reproduce.fig7 import FullEpisodeRecorder, mean_change, used_share
+from sb3_knntd.experiments.reproduce.settings import ALGORITHMS, load_settings, make_model, total_steps
+from sb3_knntd.experiments.reproduce.statistics import interval, quantile
 
 PNG = b"\x89PNG\r\n\x1a\n"
 LEAST_PICTURE = 20_000
@@ -400,7 +400,7 @@ def test_a_failed_seed_is_told_and_leaves_no_verdict(
 ) -> None:
     settings = load_settings("fig3")
     settings["paper"]["knntd"] = {**settings["paper"]["knntd"], "gamma": 2.0}
-    monkeypatch.setattr("sb3_knntd.reproduce.command.load_settings", lambda name: settings)
+    monkeypatch.setattr("sb3_knntd.experiments.reproduce.command.load_settings", lambda name: settings)
     assert main(["reproduce", "fig3", "--seeds", "1", "--out", str(tmp_path)]) == 1
     error = capsys.readouterr().err
     assert "gamma must be" in error

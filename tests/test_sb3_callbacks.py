@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from toy_envs import DriftEnv, RecordingVecEnv
 
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.audience import PatientCallback
+from sb3_knntd.common.callback_dispatcher import PatientCallback
 
 Algorithm = type[KNNTD | ExA]
 MakeModel = Callable[..., KNNTD | ExA]

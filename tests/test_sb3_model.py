@@ -63,6 +63,7 @@ def test_environments_of_gymnasium_vector(order: Callable[[Any], tuple[Any, ...]
         assert "VecEnv" in message
         assert "make_vec_env(id, n_envs)" in message
         assert "mage" not in message
+    assert "make_vec_env" in message_of(lambda: KNNTD("CartPole-v1").set_env(envs))
     envs.close()
 
 

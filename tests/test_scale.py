@@ -26,11 +26,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from toy_envs import GridEnv
 
 from sb3_knntd import KNNTD, policies
-from sb3_knntd.compiled_learner import CompiledLearner
 from sb3_knntd.kernels import desk, nearest, perceive, step
 from sb3_knntd.kernels import memory as memory_kernels
-from sb3_knntd.learner import TorchLearner
-from sb3_knntd.memory import DenseTable, HashedTable
+from sb3_knntd.learners.base import TorchLearner
+from sb3_knntd.learners.compiled import CompiledLearner
+from sb3_knntd.q_table import DenseTable, HashedTable
 
 
 class Walk(gym.Env[np.ndarray, int]):

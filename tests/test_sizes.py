@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.checks import check_size, in_bytes
+from sb3_knntd.common.checks import check_size, in_bytes
 from sb3_knntd.filters import DeltaFilter
 
 
@@ -87,7 +87,7 @@ def test_large_lattices_of_which_little_is_kept_are_taken(env: gym.Env[Any, Any]
 
 
 def test_sizes_are_told_in_units_that_are_read_easily() -> None:
-    assert [in_bytes(n) for n in (0, 1000, 2**10, 3 * 2**29, 10**20)] == [
-        "0 bytes", "1,000 bytes", "1 KiB", "1.5 GiB", "86.74 EiB",
+    assert [in_bytes(n) for n in (0, 1000, 2**10, 3 * 2**29, 10**20, 10**400)] == [
+        "0 bytes", "1,000 bytes", "1 KiB", "1.5 GiB", "86.74 EiB", "1.00e+400 bytes",
     ]  # fmt: skip
     check_size("as much as is taken", 2**32, "nothing")

@@ -30,7 +30,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import sb3_knntd.cli
 from sb3_knntd import KNNTD, ExA
 from sb3_knntd.cli import CommandError, main
-from sb3_knntd.schedules import parse_schedule
+from sb3_knntd.common.schedules import parse_schedule
 from sb3_knntd.zoo import experiment, register
 from sb3_knntd.zoo.configuration_first import ConfigurationFirst
 from sb3_knntd.zoo.schedules import with_schedules

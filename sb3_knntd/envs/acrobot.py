@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_knntd.checks import check_word
+from sb3_knntd.common.checks import check_word
 from sb3_knntd.envs.base import PaperEnv, State
 from sb3_knntd.envs.rendering import BLUE, GREEN, INK, ORANGE, SKY, STEEL, Canvas, turned
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium import logger, spaces
 from gymnasium.error import ResetNeeded
 
-from sb3_knntd.checks import check_word
+from sb3_knntd.common.checks import check_word
 from sb3_knntd.envs.rendering import Canvas
 
 ActionT = TypeVar("ActionT")

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_knntd.checks import check_integer, check_number, check_word
+from sb3_knntd.common.checks import check_integer, check_number, check_word
 from sb3_knntd.envs.base import ActionT, PaperEnv, State
 from sb3_knntd.envs.rendering import BLUE, GROUND, INK, ORANGE, SKY, STEEL, Canvas, turned
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_knntd.checks import check_integer
+from sb3_knntd.common.checks import check_integer
 from sb3_knntd.envs.base import PaperEnv, State
 from sb3_knntd.envs.mountain_car import (
     FORCE,

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_knntd.checks import check_flag
+from sb3_knntd.common.checks import check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
 from sb3_knntd.filters.table import Arguments, DeltaTable

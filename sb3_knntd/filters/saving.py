@@ -8,9 +8,9 @@ from typing import Any
 from gymnasium import spaces
 from stable_baselines3.common.save_util import is_json_serializable, load_from_zip_file, save_to_zip_file
 
-from sb3_knntd.files import read_description, replacing
+from sb3_knntd.common.files import read_description, replacing
+from sb3_knntd.common.plain import encodable, objects_for
 from sb3_knntd.filters.table import Arguments, DeltaTable
-from sb3_knntd.plain import encodable, objects_for
 
 #: What a file says that it holds.
 CONTENT = "sb3_knntd filter"

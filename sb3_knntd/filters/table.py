@@ -9,9 +9,9 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_knntd.actions import make_action_columns
+from sb3_knntd.actions.columns import make_action_columns
 from sb3_knntd.base import progress_remaining
-from sb3_knntd.checks import (
+from sb3_knntd.common.checks import (
     check_flag,
     check_integer,
     check_number,
@@ -21,12 +21,12 @@ from sb3_knntd.checks import (
     check_word,
     shown,
 )
+from sb3_knntd.common.state_checks import checked_integer, checked_points, checked_tensor
 from sb3_knntd.kernels.filter import ADAPTIVE, COUNT, FIXED, OF_UPDATE
 from sb3_knntd.perception import Perceiver, make_bounds, make_points, make_weights
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.perception.points import AUTO_POINTS_PER_DIMENSION, count_neighbors
 from sb3_knntd.perception.search import make_search
-from sb3_knntd.states import checked_integer, checked_points, checked_tensor
 
 #: ``points="auto"``: a lattice of about this many points, fewer than a learner's: each entry has to average noise.
 AUTO_POINTS = 2000

@@ -10,6 +10,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 try:
     import numba
 
+    from sb3_knntd.kernels.cache import keep
+
     AVAILABLE = not getattr(numba.config, "DISABLE_JIT", 0)
     #: why numba cannot be used, empty if it can
     REASON = "" if AVAILABLE else "NUMBA_DISABLE_JIT is set"
@@ -28,10 +30,9 @@ def jit(function: Function, forceinline: bool = False) -> Function:
     """
     if not AVAILABLE:
         return function
-    try:
-        return cast(Function, numba.njit(cache=True, nogil=True, forceinline=forceinline)(function))
-    except RuntimeError:  # there is no folder that numba may write to
-        return cast(Function, numba.njit(nogil=True, forceinline=forceinline)(function))
+    compiled = numba.njit(nogil=True, forceinline=forceinline)(function)
+    keep(compiled)
+    return cast(Function, compiled)
 
 
 def inlined(function: Function) -> Function:

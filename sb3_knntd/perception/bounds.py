@@ -9,8 +9,8 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_knntd.checks import check_numbers, shown
-from sb3_knntd.states import checked_tensor
+from sb3_knntd.common.checks import check_numbers, shown
+from sb3_knntd.common.state_checks import checked_tensor
 
 #: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
 LARGEST_SENSIBLE_BOUND = 1e10

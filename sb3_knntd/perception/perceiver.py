@@ -9,13 +9,13 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels.perceive import FOUND, are_within
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.points import Lattice, Points
 from sb3_knntd.perception.search import Neighbors, Search
 from sb3_knntd.perception.search.base import nearest_by_tensors
 from sb3_knntd.perception.weights import KernelWeights, Weights
-from sb3_knntd.tracing import is_traced
 
 
 class Perception(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_knntd.checks import check_integer, check_numbers, check_size, shown
+from sb3_knntd.common.checks import check_integer, check_numbers, check_size, shown
 from sb3_knntd.perception.bounds import Bounds, count_states
 
 #: ``points="auto"``: a lattice of about this many points in all, with at most so many in a dimension.

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Protocol
 
 import torch as th
 
-from sb3_knntd.checks import LEAST, check_number, check_word, shown
+from sb3_knntd.common.checks import LEAST, check_number, check_word, shown
+from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels.perceive import GAUSSIAN, INVERSE_QUADRATIC
-from sb3_knntd.tracing import is_traced
 
 
 class Weights(Protocol):
@@ -74,7 +74,13 @@ class Custom:
         self.function = function
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
-        answer = self.function(squared_distances)
+        try:
+            answer = self.function(squared_distances)
+        except Exception as error:
+            raise ValueError(
+                f"weights: the function must take squared distances, an array (batch, k); {shown(self.function)} "
+                f"raised {type(error).__name__}: {error}"
+            ) from error
         if is_traced():
             return self._recorded(answer)
         try:
@@ -127,16 +133,7 @@ def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
     # neighbours, so that a function that mixes up the two axes is found out.
     reach = th.linspace(0.0, 1.0, n_neighbors, dtype=th.float64)
     scales, offsets = th.linspace(0.0, 4.0, n_neighbors + 2), th.linspace(0.0, 12.0, n_neighbors + 2)
-    distances = scales[:, None].double() * reach + offsets[:, None].double()
-    try:
-        custom(distances)
-    except ValueError:
-        raise
-    except Exception as error:
-        raise ValueError(
-            f"weights must be {', '.join(map(repr, _BUILT_IN))} or a function of squared distances (batch, k); got "
-            f"{shown(weights)}, which raised {type(error).__name__}: {error}"
-        ) from error
+    custom(scales[:, None].double() * reach + offsets[:, None].double())
     return custom
 
 

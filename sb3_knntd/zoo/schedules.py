@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sb3_knntd.schedules import parse_schedule
+from sb3_knntd.common.schedules import parse_schedule
 
 #: Arguments of the algorithms that can be schedules.
 SCHEDULED = ("learning_rate", "trace_decay", "temperature")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_knntd.checks import check_size, check_word
+from sb3_knntd.common.checks import check_size, check_word
 from sb3_knntd.kernels import jit
 from sb3_knntd.perception.points import Lattice, Points
 from sb3_knntd.perception.search.base import Neighbors, Search

@@ -1,0 +1,3 @@
+"""From action values to an action."""
+
+from __future__ import annotations

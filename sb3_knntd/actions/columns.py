@@ -1,0 +1,116 @@
+"""The columns of the table as continuous actions."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_knntd.common.checks import check_integer, check_numbers, check_size, check_word, in_bytes, shown
+
+#: ``action_table=None``: all combinations of the action points up to so many, one table a dimension beyond.
+MOST_JOINT_COLUMNS = 128
+#: A row of more columns than this is refused: 8 MiB for each point that is visited.
+MOST_COLUMNS = 2**20
+
+
+class ActionColumns(NamedTuple):
+    """
+    What each column of the table stands for.
+
+    :param points: its action, shape (n_columns, action_dim), action units; in a factored table zero in all but one
+        dimension
+    :param blocks: where the columns of each of the action's parts begin, and the end, shape (n_blocks + 1,), int64
+    :param lists: the action points of each dimension, rising
+    """
+
+    points: np.ndarray
+    blocks: np.ndarray
+    lists: list[np.ndarray]
+
+
+def make_action_columns(action_space: spaces.Box, action_points: Any, action_table: str | None) -> ActionColumns:
+    """
+    :param action_space: Box with finite bounds
+    :param action_points: an int or one int a dimension for evenly spaced points over the space, or a list of arrays,
+        one a dimension (for one dimension an array will do), in action units
+    :param action_table: ``"joint"`` (a column for every combination), ``"factored"`` (columns for each dimension by
+        itself), or ``None``: joint up to 128 combinations
+    :return: the columns
+    :raises ValueError: if the bounds are infinite, the points do not fit the space, or a joint table has more than 2²⁰
+        columns
+    """
+    low, high = action_space.low.reshape(-1).astype(np.float64), action_space.high.reshape(-1).astype(np.float64)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(
+            f"the action space must have finite bounds; got {action_space}. Bound it, e.g. by "
+            "gymnasium.wrappers.RescaleAction or a Box of your own"
+        )
+    lists = [
+        _points_of_dimension(dimension, given, low[dimension], high[dimension], action_space.dtype)
+        for dimension, given in enumerate(_by_dimension(action_points, len(low)))
+    ]
+    n_joint = math.prod(len(points) for points in lists)
+    if action_table is None:
+        action_table = "joint" if n_joint <= MOST_JOINT_COLUMNS else "factored"
+    check_word("action_table", action_table, ["joint", "factored"])
+    if action_table == "joint":
+        if n_joint > MOST_COLUMNS:
+            raise ValueError(
+                f"action_table='joint' would need {n_joint:,} columns for {len(lists)} action dimensions, "
+                f"{in_bytes(8 * n_joint)} for each point visited: use action_table='factored', or fewer "
+                "action_points"
+            )
+        return ActionColumns(np.array(list(product(*lists))), np.array([0, n_joint]), lists)
+    blocks = np.concatenate(([0], np.cumsum([len(points) for points in lists])))
+    columns = np.zeros((blocks[-1], len(lists)))
+    for dimension, points in enumerate(lists):
+        columns[blocks[dimension] : blocks[dimension + 1], dimension] = points
+    return ActionColumns(columns, blocks, lists)
+
+
+def _by_dimension(action_points: Any, action_dim: int) -> list[Any]:
+    if isinstance(action_points, str):
+        raise ValueError(f"action_points must be an int, one int a dimension, or arrays; got {shown(action_points)}")
+    if _is_single(action_points):
+        return [check_integer("action_points", action_points, 2)] * action_dim
+    given = list(action_points)
+    # For one dimension the list of points itself may stand for the list of lists.
+    if action_dim == 1 and given and all(map(_is_single, given)) and len(given) != 1:
+        return [given]
+    if len(given) != action_dim:
+        raise ValueError(
+            f"action_points: an int or an array for each of the {action_dim} action dimensions is needed; got "
+            f"{len(given)}: {shown(action_points)}"
+        )
+    return given
+
+
+def _points_of_dimension(dimension: int, given: Any, low: float, high: float, dtype: Any) -> np.ndarray:
+    name = f"action_points of dimension {dimension}"
+    if _is_single(given):
+        n_points = check_integer(name, given, 2)
+        # Each is a column of the table, and an action besides.
+        check_size(f"{name}: {n_points} points", 3 * 8 * n_points, "give fewer")
+        return np.linspace(low, high, n_points)
+    points = check_numbers(name, given)
+    if points.ndim != 1 or len(points) == 0:
+        raise ValueError(f"{name} must be a list of at least one number; got {shown(given)}")
+    # A bound of the space is what its type made of the number that was meant, 0.7 in float32 say. What the type cannot
+    # hold is no bound.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for bound in (low, high):
+            points = np.where(points.astype(dtype) == bound, bound, points)
+    if not np.isfinite(points).all() or points.min() < low or points.max() > high:
+        raise ValueError(f"{name} must lie within the action space, [{low:g}, {high:g}]; got {shown(points.tolist())}")
+    if np.any(np.diff(points) <= 0):
+        raise ValueError(f"{name} must rise; got {shown(points.tolist())}")
+    return points
+
+
+def _is_single(value: Any) -> bool:
+    """Whether it is no array of any kind, nor a list that could be made one."""
+    return not isinstance(value, (list, tuple)) and np.ndim(value) == 0

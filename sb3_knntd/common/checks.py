@@ -1,0 +1,215 @@
+"""Checks of what a user passes in. Each names the argument, the value given and what would do."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+#: The least number that is taken where one is to be above 0 and is divided by: its square and quotients stay numbers.
+LEAST = 1e-100
+#: A count beyond this has no place in 64 bits.
+LARGEST_COUNT = 2**63 - 1
+#: What would take more bytes than this is refused rather than begun.
+LARGEST_SIZE = 2**32
+#: Longer values are cut off in a message.
+LONGEST = 300
+#: Where a schedule is looked at before it is used: at its beginning, middle and end.
+PROGRESS = (1.0, 0.5, 0.0)
+
+
+def shown(value: Any) -> str:
+    """
+    :param value: what was given
+    :return: how a message shows it, cut off if it is long
+    """
+    try:
+        text = repr(value)
+    except ValueError:  # Python does not write out integers of thousands of digits.
+        text = f"{type(value).__name__} of too many digits to show"
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+def check_word(name: str, value: Any, words: Iterable[str]) -> None:
+    """
+    :param name: name of the argument
+    :param value: what was given
+    :param words: what is allowed
+    :raises ValueError: if ``value`` is none of ``words``
+    """
+    allowed = list(words)
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}; got {shown(value)}")
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """
+    :param name: name of the argument
+    :param value: what was given
+    :return: the value as a bool
+    :raises ValueError: if ``value`` is neither ``True`` nor ``False``
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False; got {shown(value)}")
+    return bool(value)
+
+
+def check_verbose(value: Any) -> int:
+    """
+    :param value: what was given as ``verbose``
+    :return: the value as an int, 1 for ``True``
+    :raises ValueError: if it is neither an integer >= 0 nor a bool
+    """
+    return int(value) if isinstance(value, bool) else check_integer("verbose", value, 0)
+
+
+def check_number(
+    name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, above: bool = False
+) -> float:
+    """
+    :param name: name of the argument
+    :param value: what was given
+    :param low: lowest value allowed, or with ``above`` the value it must exceed
+    :param high: highest value allowed
+    :param above: whether ``low`` itself is excluded
+    :return: the value as a float
+    :raises ValueError: if ``value`` is not a finite number within the limits
+    """
+    try:
+        number = float(_real(value))
+    except OverflowError:
+        number = math.inf
+    if not (math.isfinite(number) and (number > low if above else number >= low) and number <= high):
+        raise ValueError(f"{name} must be a finite number in {_range(low, high, above)}; got {shown(value)}")
+    return number
+
+
+def check_integer(name: str, value: Any, low: int, high: int = LARGEST_COUNT) -> int:
+    """
+    :param name: name of the argument
+    :param value: what was given
+    :param low: lowest value allowed
+    :param high: highest value allowed
+    :return: the value as an int
+    :raises ValueError: if ``value`` is not an integer within the limits
+    """
+    number = _real(value)
+    # NaN and infinity are no integers, and have none.
+    whole = isinstance(number, int) or (math.isfinite(number) and int(number) == number)
+    if not (whole and low <= number <= high):
+        wanted = f">= {low}" if high == LARGEST_COUNT else f"from {low} to {high}"
+        beyond = " and < 2^63" if number > high == LARGEST_COUNT else ""
+        raise ValueError(f"{name} must be an integer {wanted}{beyond}; got {shown(value)}")
+    return int(number)
+
+
+def check_numbers(name: str, value: Any) -> np.ndarray:
+    """
+    :param name: name of the argument
+    :param value: what was given
+    :return: the value as an array, float64
+    :raises ValueError: if ``value`` is not an array of numbers, or cannot be made one
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} must be an array of numbers; got {shown(value)}") from error
+    # Signed, unsigned and floating: no words, no truth values, nothing complex.
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be an array of numbers; got {shown(value)}")
+    return array.astype(np.float64)
+
+
+def check_schedule(
+    name: str, value: float | Callable[[float], float], low: float, high: float = math.inf, *, above: bool = False
+) -> float | Callable[[float], float]:
+    """
+    Check a number, or a function of the remaining progress (from 1 to 0) at its beginning, middle and end.
+
+    :param name: name of the argument
+    :param value: number or schedule
+    :param low: lowest value allowed, or with ``above`` the value it must exceed
+    :param high: highest value allowed
+    :param above: whether ``low`` itself is excluded
+    :return: the number as a float, or the schedule
+    :raises ValueError: if a value is out of range, or the function raises
+    """
+    if not callable(value):
+        return check_number(name, value, low, high, above=above)
+    for progress in PROGRESS:
+        at = f"{name} at progress_remaining={progress:g}"
+        try:
+            number = value(progress)
+        except Exception as error:
+            raise ValueError(
+                f"{at} must be a finite number in {_range(low, high, above)}; the schedule raised "
+                f"{type(error).__name__}: {error}"
+            ) from error
+        check_number(at, number, low, high, above=above)
+    return value
+
+
+def check_path(name: str, value: Any) -> Path:
+    """
+    :param name: name of the argument
+    :param value: what was given
+    :return: the value as a path
+    :raises ValueError: if ``value`` is no path
+    """
+    if not isinstance(value, (str, os.PathLike)) or "\0" in os.fspath(value):
+        raise ValueError(f"{name} must be a path, a str or a pathlib.Path; got {shown(value)}")
+    return Path(value)
+
+
+def check_name(name: str, value: Any) -> str:
+    """
+    :param name: name of the argument
+    :param value: what was given
+    :return: the value
+    :raises ValueError: if ``value`` cannot be part of a file's name
+    """
+    if not isinstance(value, str) or any(mark in value for mark in "/\\\0"):
+        raise ValueError(f"{name} must be part of a file's name, a str without slashes; got {shown(value)}")
+    return value
+
+
+def check_size(what: str, n_bytes: int, advice: str) -> None:
+    """
+    Refuse what would take the machine's memory, before it is begun.
+
+    :param what: name of the argument, and what it would need the memory for
+    :param n_bytes: how many bytes that would take
+    :param advice: what to give instead
+    :raises ValueError: if that is more than :data:`LARGEST_SIZE`
+    """
+    if n_bytes > LARGEST_SIZE:
+        raise ValueError(f"{what} would take {in_bytes(n_bytes)}, more than {in_bytes(LARGEST_SIZE)}: {advice}")
+
+
+def in_bytes(number: int) -> str:
+    """
+    :param number: a number of bytes
+    :return: the same in the unit that it is easily read in
+    """
+    units = ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
+    power = max(number.bit_length() - 1, 0) // 10
+    if power >= len(units):
+        # Combinations can be more than a float holds.
+        return f"{Decimal(number):.2e} bytes"
+    return f"{number / 1024**power:,.4g} {units[power]}"
+
+
+def _range(low: float, high: float, above: bool) -> str:
+    return f"{'(' if above else '['}{low:g}, {high:g}{']' if math.isfinite(high) else ')'}"
+
+
+def _real(value: Any) -> Any:
+    """The int or float that ``value`` is, also as an array or a tensor of no axes; NaN for all else."""
+    if getattr(value, "shape", None) == () and hasattr(value, "item"):
+        value = value.item()
+    return value if isinstance(value, (int, float, np.floating)) and not isinstance(value, bool) else math.nan

@@ -1,0 +1,60 @@
+"""Schedules, and the words for them."""
+
+from __future__ import annotations
+
+import math
+
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+
+from sb3_knntd.common.checks import check_schedule
+
+#: What words for schedules begin with.
+LINEAR = "lin_"
+
+
+def parse_schedule(name: str, word: str) -> LinearSchedule:
+    """
+    :param name: name of the argument
+    :param word: ``"lin_START"``, which falls to 0 as in RL Zoo, or ``"lin_START_END"``
+    :return: the schedule, linear over the whole training
+    :raises ValueError: if ``word`` is neither
+    """
+    try:
+        kind, start, *rest = word.split("_")
+        (end,) = rest or ["0"]
+        if f"{kind}_" != LINEAR:
+            raise ValueError
+        return LinearSchedule(float(start), float(end), 1.0)
+    except ValueError:
+        raise ValueError(
+            f"{name} must be a number, 'lin_START' (falls to 0) or 'lin_START_END' (e.g. 'lin_0.5_0.05'); got {word!r}"
+        ) from None
+
+
+def check_rate(
+    name: str, value: float | Schedule | str, low: float, high: float = math.inf, *, above: bool = False
+) -> float | Schedule | str:
+    """
+    Check what :func:`make_schedule` takes.
+
+    :param name: name of the argument
+    :param value: number, schedule, or word for one
+    :param low: lowest value allowed, or with ``above`` the value it must exceed
+    :param high: highest value allowed
+    :param above: whether ``low`` itself is excluded
+    :return: the number as a float, or the schedule or word
+    :raises ValueError: if it is none of these, or a value is out of range
+    """
+    if isinstance(value, str) and value.startswith(LINEAR):
+        check_schedule(name, parse_schedule(name, value), low, high, above=above)
+        return value
+    return check_schedule(name, value, low, high, above=above)  # type: ignore[arg-type]
+
+
+def make_schedule(value: float | Schedule | str) -> FloatSchedule:
+    """
+    :param value: number, schedule, or word for one, checked
+    :return: the schedule
+    """
+    return FloatSchedule(parse_schedule("schedule", value) if isinstance(value, str) else value)

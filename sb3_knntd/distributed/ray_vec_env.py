@@ -1,0 +1,568 @@
+"""Environments on the machines of a Ray cluster, as one VecEnv (extra ``[ray]``)."""
+
+from __future__ import annotations
+
+import textwrap
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.env_util import is_wrapped, unwrap_wrapper
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.patch_gym import _patch_env
+from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
+
+from sb3_knntd.common.checks import check_integer, check_number, shown
+from sb3_knntd.common.files import replace_file
+
+try:
+    import ray
+    from ray import cloudpickle
+    from ray.actor import ActorHandle
+    from ray.exceptions import (
+        LocalRayletDiedError,
+        NodeDiedError,
+        ObjectLostError,
+        OutOfMemoryError,
+        RayActorError,
+        RayTaskError,
+        WorkerCrashedError,
+    )
+except ImportError as error:
+    raise ImportError("RayVecEnv needs Ray: pip install 'sb3-knntd[ray]'") from error
+
+from sb3_knntd.distributed.ray_jobs import connect
+
+#: Seconds without room in the cluster after which the user is told what is waited for.
+PATIENCE = 30.0
+#: What Ray says where a process or its machine has gone, or with it what it had answered.
+DEATHS = (
+    RayActorError,
+    NodeDiedError,
+    WorkerCrashedError,
+    LocalRayletDiedError,
+    OutOfMemoryError,
+    ObjectLostError,
+)
+#: Options of Ray's actors that are settled here, or are parameters of their own.
+SETTLED = {"num_cpus", "max_restarts", "max_task_retries", "max_concurrency", "name", "lifetime", "get_if_exists"}
+
+
+class EnvActor:
+    """
+    An environment in a process of its own.
+
+    What comes in and goes out is pickled here rather than by Ray, from which arrays come read-only.
+    """
+
+    env: gym.Env[Any, Any]
+
+    def __init__(self) -> None:
+        self.reset_info: dict[str, Any] = {}
+
+    def answer(self, request: bytes) -> bytes:
+        """
+        :param request: a method's name, its arguments and its keyword arguments, pickled
+        :return: what the method returns, pickled
+        """
+        name, args, kwargs = cloudpickle.loads(request)
+        return bytes(cloudpickle.dumps(getattr(self, name)(*args, **kwargs)))
+
+    def begin(self, env_fn: bytes, attributes: Mapping[str, bytes], log: str | None, restarts: int) -> str | None:
+        """
+        Make the environment.
+
+        :param env_fn: what makes it, pickled
+        :param attributes: what to set then, by name, pickled
+        :param log: Monitor's file of the environment that this one takes the place of
+        :param restarts: how often that has happened, with this time
+        :return: Monitor's file of this one, ``None`` if there is none
+        """
+        file = Path(log) if log else None
+        before = file.read_bytes() if file and file.exists() else b""
+        self.env = _patch_env(cloudpickle.loads(env_fn)())
+        if file and before and not file.read_bytes().startswith(before):
+            # The new Monitor has begun the file anew. SB3's load_results reads this one beside it.
+            stem = file.name.removesuffix(Monitor.EXT)
+            replace_file(file.with_name(f"{stem}before_restart_{restarts}.{Monitor.EXT}"), before)
+        for name, value in attributes.items():
+            self.set_attr(name, cloudpickle.loads(value))
+        monitor = unwrap_wrapper(self.env, Monitor)
+        writer = monitor.results_writer if isinstance(monitor, Monitor) else None
+        return writer.file_handler.name if writer else None
+
+    def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
+        """
+        :return: of the observations and of the actions
+        """
+        return self.env.observation_space, self.env.action_space
+
+    def reset(self, seed: int | None, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: ``None`` to go on with the random numbers as they are
+        :param options: the environment's own
+        :return: the first observation and its info
+        """
+        observation, self.reset_info = self.env.reset(seed=seed, **({"options": options} if options else {}))
+        return observation, self.reset_info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, dict[str, Any], dict[str, Any]]:
+        """
+        Make a step, and begin the next episode if this one is over.
+
+        :param action: the environment's
+        :return: observation, reward, whether the episode is over, info, and info of the last reset
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info["TimeLimit.truncated"] = truncated and not terminated
+        done = terminated or truncated
+        if done:
+            info["terminal_observation"] = observation
+            observation, self.reset_info = self.env.reset()
+        return observation, reward, done, info, self.reset_info
+
+    def render(self) -> Any:
+        """
+        :return: what the environment's ``render`` returns
+        """
+        return self.env.render()
+
+    def has_attr(self, name: str) -> bool:
+        """
+        :param name: of an attribute
+        :return: whether the environment or a wrapper has it
+        """
+        try:
+            self.env.get_wrapper_attr(name)
+        except AttributeError:
+            return False
+        return True
+
+    def get_attr(self, name: str) -> Any:
+        """
+        :param name: of an attribute of the environment or a wrapper
+        :return: its value
+        """
+        return self.env.get_wrapper_attr(name)
+
+    def set_attr(self, name: str, value: Any) -> None:
+        """
+        :param name: of an attribute of the outermost wrapper
+        :param value: its new value
+        """
+        setattr(self.env, name, value)
+
+    def env_method(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """
+        :param name: of a method of the environment or a wrapper
+        :param args: its arguments
+        :param kwargs: its keyword arguments
+        :return: what it returns
+        """
+        return self.env.get_wrapper_attr(name)(*args, **kwargs)
+
+    def is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]]) -> bool:
+        """
+        :param wrapper_class: of a wrapper
+        :return: whether one around the environment is of it
+        """
+        return is_wrapped(self.env, wrapper_class)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+
+class RayVecEnv(VecEnv):
+    """
+    SB3's SubprocVecEnv over a Ray cluster: each environment is in a process of its own, on any of its machines. It is
+    for simulators that take milliseconds a step or more. With the same seeds it returns what SubprocVecEnv returns.
+
+    It uses the Ray that this process is connected to, and connects it if it is not; the connection then stays until the
+    program ends or calls ``ray.shutdown()``. What the environments need must be installed on all machines.
+
+    .. code-block:: python
+
+        kwargs = {"address": "auto", "num_cpus": 2}
+        venv = make_vec_env("Ant-v5", 32, vec_env_cls=RayVecEnv, vec_env_kwargs=kwargs)
+
+    An environment whose process or machine dies is made anew, wherever there is room. Its episode ends with that step,
+    truncated: the reward is 0, ``terminal_observation`` in its info is the last observation that was seen,
+    ``TimeLimit.truncated`` and ``env_restarted`` are true, and of a Monitor within there is no ``episode``. The new
+    environment
+
+    - has the attributes that :meth:`set_attr` has set; what its methods have changed is lost;
+    - is reset with a seed drawn from its last one and the number of restarts, without a seed if it had none;
+    - keeps the rows of a Monitor's file that it finds on its machine, under a name beside it.
+
+    If it dies in :meth:`reset` or while it is asked something, the same is asked of the new one. What an environment
+    raises is raised here, with its traceback, and is no death.
+
+    :param env_fns: make the environments, each its own
+    :param num_cpus: CPUs that Ray reserves for each environment, any number >= 0; with less than 1 they share
+    :param actor_options: other options of a Ray actor, such as ``num_gpus``, ``memory`` (bytes), ``resources``,
+        ``runtime_env`` and ``scheduling_strategy``, by default ``"SPREAD"``, over the machines
+    :param address: ``"auto"`` for the cluster that this machine belongs to, ``"ray://host:port"`` for one elsewhere,
+        ``None`` for that of ``RAY_ADDRESS``, or else one of this machine alone; of no effect if already connected
+    :param max_restarts: how often in a row an environment is made anew without coming to the end of an episode, an
+        integer >= 0
+    :param timeout: seconds that an environment has for an answer, above 0; one that takes longer counts as dead.
+        ``None`` waits for ever
+    :param placement_timeout: seconds to wait for room in the cluster, above 0
+    :raises ImportError: on import of the module, if Ray is not installed
+    :raises ValueError: if an argument does not fit; the message says which, and what would
+    :raises ConnectionError: if there is no cluster at ``address``
+    :raises TimeoutError: if the cluster has no room for the environments
+    :raises RuntimeError: if an environment dies more often than ``max_restarts``, here or later
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any]]],
+        num_cpus: float = 1.0,
+        actor_options: Mapping[str, Any] | None = None,
+        address: str | None = None,
+        max_restarts: int = 3,
+        timeout: float | None = None,
+        placement_timeout: float = 300.0,
+    ) -> None:
+        if not isinstance(env_fns, Sequence) or not env_fns or not all(map(callable, env_fns)):
+            raise ValueError(f"env_fns must be functions that make environments, at least one; got {shown(env_fns)}")
+        n_envs = len(env_fns)
+        if address is not None and not isinstance(address, str):
+            raise ValueError(f"address must be 'auto', 'ray://host:port' or None; got {shown(address)}")
+        if not (actor_options is None or isinstance(actor_options, Mapping)):
+            raise ValueError(f"actor_options must be a dict of options of a Ray actor; got {shown(actor_options)}")
+        options = dict(actor_options or {})
+        if SETTLED & options.keys():
+            raise ValueError(
+                f"actor_options cannot have {', '.join(sorted(SETTLED & options.keys()))}: num_cpus and max_restarts "
+                "are parameters of RayVecEnv, and the rest it settles itself"
+            )
+        self.max_restarts = check_integer("max_restarts", max_restarts, 0)
+        self.timeout = None if timeout is None else check_number("timeout", timeout, 0.0, above=True)
+        self.placement_timeout = check_number("placement_timeout", placement_timeout, 0.0, above=True)
+        options = {
+            "scheduling_strategy": "SPREAD",
+            **options,
+            "num_cpus": check_number("num_cpus", num_cpus, 0.0),
+            # Ray's own restarts would put an environment that was never reset in the place of one in an episode.
+            "max_restarts": 0,
+            "max_task_retries": 0,
+        }
+        try:
+            self._actor_class = ray.remote(EnvActor).options(**options)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ValueError(f"num_cpus={num_cpus!r}, actor_options={shown(actor_options)}: {error}") from error
+        asked_for = {"num_cpus": num_cpus, **(actor_options or {})}
+        self._asked_for = {key: value for key, value in asked_for.items() if key != "runtime_env"}
+
+        #: how often each environment was made anew, shape (n_envs,)
+        self.restarts = [0] * n_envs
+        self.waiting = False
+        self.closed = False
+        self._deaths_in_row = [0] * n_envs
+        self._env_fns = [cloudpickle.dumps(env_fn) for env_fn in env_fns]
+        self._attributes: list[dict[str, bytes]] = [{} for _ in env_fns]
+        self._logs: list[str | None] = [None] * n_envs
+        self._last_seeds: list[int | None] = [None] * n_envs
+        # The last observation of each environment that is in an episode.
+        self._observations: dict[int, Any] = {}
+        # First observation and info of environments that were made anew in an episode, until a step tells of it.
+        self._begun_anew: dict[int, tuple[Any, dict[str, Any]]] = {}
+        self._steps: list[tuple[int, ray.ObjectRef[bytes]]] = []
+        self._actors: dict[int, ActorHandle[Any]] = {}
+
+        connect(address, log_to_driver=True)
+        try:
+            self._restart(self._start(range(n_envs)))
+            observation_space, action_space = self._call([0], "spaces")[0]
+            super().__init__(n_envs, observation_space, action_space)
+        except BaseException:
+            self._kill()
+            raise
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """
+        :param actions: shape (n_envs, *action_shape)
+        """
+        self._steps = [
+            (index, self._send(index, _pickled("step", action)))
+            for index, action in zip(range(self.num_envs), actions, strict=True)
+            if index not in self._begun_anew
+        ]
+        self.waiting = True
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        :return: observations, rewards of shape (n_envs,), whether episodes are over, of the same shape, and infos
+        """
+        steps = [(index, step) for index, step in self._steps if index not in self._begun_anew]
+        try:
+            answers, deaths = self._receive(steps)
+            self._restart(deaths)
+        finally:
+            self._steps, self.waiting = [], False
+        made = {index: answer for (index, _), answer in zip(steps, answers, strict=True) if index not in deaths}
+        for index, (_, _, done, _, _) in made.items():
+            if done:
+                self._deaths_in_row[index] = 0
+        results = [made[index] if index in made else self._cut_off(index) for index in range(self.num_envs)]
+        observations, rewards, dones, infos, reset_infos = zip(*results, strict=True)
+        self._observations = dict(enumerate(observations))
+        self.reset_infos = list(reset_infos)
+        return _stack_obs(observations, self.observation_space), np.stack(rewards), np.stack(dones), list(infos)
+
+    def reset(self) -> VecEnvObs:
+        """
+        :return: the first observations
+        """
+        # Whatever was going on is over.
+        self._steps, self.waiting = [], False
+        self._observations, self._begun_anew = {}, {}
+        for index, seed in enumerate(self._seeds):
+            if seed is not None:
+                self._last_seeds[index] = seed
+        results = self._call_each(
+            range(self.num_envs), [_pickled("reset", *given) for given in zip(self._seeds, self._options, strict=True)]
+        )
+        observations, reset_infos = zip(*results, strict=True)
+        self._observations = dict(enumerate(observations))
+        self.reset_infos = list(reset_infos)
+        self._reset_seeds()
+        self._reset_options()
+        return _stack_obs(observations, self.observation_space)
+
+    def close(self) -> None:
+        """Close the environments and end their processes."""
+        if self.closed:
+            return
+        self.closed = True
+        # Where Ray was shut down there is nobody to close.
+        if ray.is_initialized():
+            try:
+                self._receive([(index, self._send(index, _pickled("close"))) for index in self._actors])
+            finally:
+                self._kill()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """
+        :return: an image of each environment, ``None`` where they do not render to arrays
+        """
+        if self.render_mode != "rgb_array":
+            warnings.warn(
+                f"the environments' render_mode is {self.render_mode!r}; images need 'rgb_array'", stacklevel=2
+            )
+            return [None] * self.num_envs
+        return self._call(range(self.num_envs), "render")
+
+    def has_attr(self, attr_name: str) -> bool:
+        """
+        :param attr_name: of an attribute of the environments or their wrappers
+        :return: whether all have it
+        """
+        return all(self._call(range(self.num_envs), "has_attr", attr_name))
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        :param attr_name: of an attribute of the environments or their wrappers
+        :param indices: of the environments asked, ``None`` for all
+        :return: its value in each of them, a copy
+        :raises AttributeError: if one has no such attribute
+        """
+        return self._call(self._targets(indices), "get_attr", attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """
+        :param attr_name: of an attribute of the outermost wrappers
+        :param value: its new value, of which each has a copy, also environments that are made anew
+        :param indices: of the environments, ``None`` for all
+        """
+        targets = self._targets(indices)
+        self._call(targets, "set_attr", attr_name, value)
+        pickled = cloudpickle.dumps(value)
+        for index in targets:
+            self._attributes[index][attr_name] = pickled
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        :param method_name: of a method of the environments or their wrappers
+        :param method_args: its arguments
+        :param indices: of the environments, ``None`` for all
+        :param method_kwargs: its keyword arguments
+        :return: what each returns
+        :raises AttributeError: if one has no such method
+        """
+        return self._call(self._targets(indices), "env_method", method_name, *method_args, **method_kwargs)
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """
+        :param wrapper_class: of a wrapper
+        :param indices: of the environments asked, ``None`` for all
+        :return: whether each has such a wrapper around it
+        """
+        return self._call(self._targets(indices), "is_wrapped", wrapper_class)
+
+    # ------------------------------------------------------- asking and hearing
+
+    def _targets(self, indices: VecEnvIndices) -> list[int]:
+        # Negative ones count from the end.
+        return [range(self.num_envs)[index] for index in self._get_indices(indices)]
+
+    def _call(self, targets: Sequence[int], name: str, /, *args: Any, **kwargs: Any) -> list[Any]:
+        return self._call_each(targets, [_pickled(name, *args, **kwargs)] * len(targets))
+
+    def _call_each(self, targets: Sequence[int], requests: Sequence[bytes]) -> list[Any]:
+        """Ask each its own and wait for all; who dies over it is asked again when it is there anew."""
+        answers: list[Any] = [None] * len(targets)
+        left = list(range(len(targets)))
+        while left:
+            heard, deaths = self._receive([(targets[at], self._send(targets[at], requests[at])) for at in left])
+            for at, answer in zip(left, heard, strict=True):
+                answers[at] = answer
+            self._restart(deaths)
+            left = [at for at in left if targets[at] in deaths]
+        return answers
+
+    def _send(self, index: int, request: bytes) -> ray.ObjectRef[bytes]:
+        return self._actors[index].answer.remote(request)
+
+    def _receive(self, asked: Sequence[tuple[int, ray.ObjectRef[bytes]]]) -> tuple[list[Any], dict[int, Exception]]:
+        """All answers, ``None`` for those that will not come, and why not, by environment."""
+        references = [reference for _, reference in asked]
+        # All are waited for, so that none is still busy when one of them raises.
+        late = set(ray.wait(references, num_returns=len(references), timeout=self.timeout)[1]) if references else set()
+        answers: list[Any] = []
+        deaths: dict[int, Exception] = {}
+        for index, reference in asked:
+            answer = None
+            if reference in late:
+                deaths[index] = TimeoutError(f"no answer within {self.timeout:g} s")
+            else:
+                try:
+                    answer = cloudpickle.loads(ray.get(reference))
+                except RayTaskError:  # raised by the environment, whatever it is besides
+                    raise
+                except DEATHS as error:
+                    deaths[index] = error
+            answers.append(answer)
+        return answers, deaths
+
+    # ---------------------------------------------------------- life and death
+
+    def _restart(self, deaths: Mapping[int, Exception]) -> None:
+        """Make those that died anew, until they live."""
+        while deaths:
+            for index, error in deaths.items():
+                self._tell_of_death(index, error)
+            deaths = self._start(list(deaths))
+
+    def _tell_of_death(self, index: int, error: Exception) -> None:
+        # Ray's messages end with what happened.
+        reason = textwrap.shorten((str(error).strip() or type(error).__name__).splitlines()[-1], 300)
+        if self._deaths_in_row[index] >= self.max_restarts:
+            raise RuntimeError(
+                f"environment {index} has died {self._deaths_in_row[index] + 1} times in a row without an episode that "
+                f"came to its end, and max_restarts is {self.max_restarts}. Its last death: {reason}. If it always "
+                "dies, run it in this process to see why: DummyVecEnv in place of RayVecEnv"
+            ) from error
+        self._deaths_in_row[index] += 1
+        self.restarts[index] += 1
+        warnings.warn(
+            f"environment {index} died and is made anew (restart {self.restarts[index]}): {reason}", stacklevel=2
+        )
+
+    def _start(self, indices: Sequence[int]) -> dict[int, Exception]:
+        """Make environments, and reset those that were in an episode; who died over it, and why."""
+        deaths = self._place(indices)
+        living = [index for index in indices if index not in deaths]
+        logs, died = self._receive([(index, self._send(index, self._beginning(index))) for index in living])
+        deaths |= died
+        for index, log in zip(living, logs, strict=True):
+            if index not in died:
+                self._logs[index] = log
+
+        in_episodes = [index for index in living if index not in died and (self.waiting or index in self._observations)]
+        requests = [(index, self._send(index, _pickled("reset", self._next_seed(index), {}))) for index in in_episodes]
+        firsts, died = self._receive(requests)
+        deaths |= died
+        for index, first in zip(in_episodes, firsts, strict=True):
+            if index not in died:
+                self._begun_anew[index] = first
+        return deaths
+
+    def _place(self, indices: Iterable[int]) -> dict[int, Exception]:
+        """A new process for each; whose has died at once, and why."""
+        for index in indices:
+            if index in self._actors:
+                # It may live on, out of reach or busy for too long.
+                ray.kill(self._actors[index])
+            self._actors[index] = self._actor_class.remote()  # type: ignore[assignment]
+        ready: dict[ray.ObjectRef[Any], int] = {self._actors[index].__ray_ready__.remote(): index for index in indices}
+        _, without = ray.wait(list(ready), num_returns=len(ready), timeout=min(PATIENCE, self.placement_timeout))
+        if without and self.placement_timeout > PATIENCE:
+            warnings.warn(f"still waiting for {self._need(len(without))}", stacklevel=2)
+            _, without = ray.wait(without, num_returns=len(without), timeout=self.placement_timeout - PATIENCE)
+        if without:
+            raise TimeoutError(
+                f"in {self.placement_timeout:g} s (placement_timeout) Ray did not start {self._need(len(without))}"
+            )
+        deaths: dict[int, Exception] = {}
+        for reference, index in ready.items():
+            try:
+                ray.get(reference)
+            except DEATHS as error:
+                if isinstance(error, RayActorError) and error.actor_init_failed:
+                    raise
+                deaths[index] = error
+        return deaths
+
+    def _need(self, n_without: int) -> str:
+        there, free = (
+            {key: value for key, value in amounts.items() if ":" not in key and "memory" not in key}
+            for amounts in (ray.cluster_resources(), ray.available_resources())
+        )
+        return (
+            f"the processes of {n_without} of {len(self.restarts)} environments. Each asks for {self._asked_for}; the "
+            f"cluster has {there}, of which {free} is free. If that is too little, fewer environments or a smaller "
+            "num_cpus would fit"
+        )
+
+    def _beginning(self, index: int) -> bytes:
+        return _pickled("begin", self._env_fns[index], self._attributes[index], self._logs[index], self.restarts[index])
+
+    def _next_seed(self, index: int) -> int | None:
+        seed = self._last_seeds[index]
+        if seed is None:
+            return None
+        # Not the last one again, or it would live through the same episodes once more.
+        return int(np.random.SeedSequence((seed, self.restarts[index])).generate_state(1)[0])
+
+    def _cut_off(self, index: int) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
+        """The step of an environment that was made anew."""
+        observation, reset_info = self._begun_anew.pop(index)
+        info = {
+            "TimeLimit.truncated": True,
+            "env_restarted": True,
+            # Nothing was seen of environments that make steps without a reset.
+            "terminal_observation": self._observations.get(index, observation),
+        }
+        return observation, 0.0, True, info, reset_info
+
+    def _kill(self) -> None:
+        for actor in self._actors.values():
+            ray.kill(actor)
+        self._actors = {}
+
+
+def _pickled(name: str, /, *args: Any, **kwargs: Any) -> bytes:
+    return bytes(cloudpickle.dumps((name, args, kwargs)))

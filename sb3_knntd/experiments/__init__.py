@@ -1,0 +1,3 @@
+"""Comparisons, the paper's figures, the demonstration."""
+
+from __future__ import annotations

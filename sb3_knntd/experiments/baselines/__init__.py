@@ -1,0 +1,3 @@
+"""Algorithms to compare with."""
+
+from __future__ import annotations

@@ -1,0 +1,264 @@
+"""``sb3-knntd compare``: from environments, algorithms and seeds to runs, and from runs to a report."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import rl_zoo3
+
+from sb3_knntd.cli import CommandError, make_env, reason_of
+from sb3_knntd.common.files import replace_file
+from sb3_knntd.distributed.jobs import Backend, Job, Outcome, run_jobs, run_locally, usable_cores
+from sb3_knntd.experiments.compare.configurations import FLOOR, Configuration, configuration, fits, label
+from sb3_knntd.experiments.compare.experiment import experiment, prepare
+from sb3_knntd.experiments.compare.report import make_report
+from sb3_knntd.experiments.compare.results import Comparison, Run, Task, make_groups
+from sb3_knntd.experiments.compare.run import is_result, run
+
+#: What a local worker finds imported.
+PRELOADED = ("sb3_knntd.experiments.compare.run",)
+
+
+class Plan(NamedTuple):
+    """
+    What to compare; the arguments of the command.
+
+    :param envs: environments
+    :param algos: names of algorithms; acting at random is always added
+    :param seeds: of the runs
+    :param steps: environment steps of each run
+    :param defaults: whether algorithms have their defaults, not the tuned configurations
+    :param conf: by algorithm, a file of configurations
+    :param thresholds: by environment, the return that counts as having learned it
+    :param eval_points: evaluations of each run
+    :param eval_episodes: episodes of each
+    :param packages: modules that register environments
+    :param out: folder for all files
+    """
+
+    envs: Sequence[str]
+    algos: Sequence[str]
+    seeds: range
+    steps: int
+    defaults: bool
+    conf: Mapping[str, Path]
+    thresholds: Mapping[str, float]
+    eval_points: int
+    eval_episodes: int
+    packages: Sequence[str]
+    out: Path
+
+    @property
+    def command(self) -> str:
+        """The command line that computes the same, wherever it is computed."""
+        words: list[Any] = ["sb3-knntd", "compare", "--env", *self.envs, "--algos", *self.algos]
+        words += ["--seeds", len(self.seeds), "--first-seed", self.seeds[0], "--steps", self.steps]
+        words += ["--defaults"] if self.defaults else []
+        words += ["--conf", *(f"{algo}={path}" for algo, path in self.conf.items())] if self.conf else []
+        given = [f"{env}={threshold:g}" for env, threshold in self.thresholds.items()]
+        words += ["--threshold", *given] if given else []
+        words += ["--eval-points", self.eval_points, "--eval-episodes", self.eval_episodes]
+        words += ["--gym-packages", *self.packages] if self.packages else []
+        return shlex.join(str(word) for word in [*words, "--out", self.out])
+
+
+class Key(NamedTuple):
+    """
+    :param env: environment
+    :param algo: name of the algorithm
+    :param seed: seed of the run
+    """
+
+    env: str
+    algo: str
+    seed: int
+
+
+def compare(
+    plan: Plan,
+    backend: str,
+    workers: int | None = None,
+    address: str | None = None,
+    cpus: float = 1.0,
+    memory: float | None = None,
+) -> int:
+    """
+    Compute what is missing, write the report, and say where it is.
+
+    :param plan: what to compare
+    :param backend: ``"local"`` or ``"ray"``
+    :param workers: processes of this machine, ``None`` for one a core
+    :param address: of the Ray cluster
+    :param cpus: CPUs that Ray reserves for a run
+    :param memory: GiB that it reserves for a run, ``None`` for none
+    :return: exit code: 0, or 1 if runs failed
+    :raises CommandError: if the plan cannot be carried out, before anything is computed
+    """
+    try:
+        prepare(plan.packages)
+    except Exception as error:
+        raise CommandError(f"--gym-packages: {reason_of(error)}") from error
+    check_plan(plan)
+    algos = [*(algo for algo in dict.fromkeys(plan.algos) if algo != FLOOR), FLOOR]
+    chosen = choose_configurations(plan, algos)
+    jobs = {
+        Key(env, algo, seed): make_job(plan, env, algo, seed, found.hyperparams)
+        for (env, algo), found in chosen.items()
+        for seed in plan.seeds
+    }
+    with ExitStack() as stack:
+        compute = _ray(stack, address, cpus, memory) if backend == "ray" else _local(workers)
+        try:
+            outcomes = run_jobs(list(jobs.values()), plan.out / "runs", title="compare", backend=compute)
+        except OSError as error:
+            raise CommandError(f"cannot write to {plan.out}: {error}") from error
+
+    by_key = {key: outcomes[job.key] for key, job in jobs.items()}
+    failures = {f"{key.env}, {label(key.algo)}, seed {key.seed}": o.error for key, o in by_key.items() if o.error}
+    for name, reason in failures.items():
+        print(f"Failed: {name}\n{reason}", file=sys.stderr)
+    comparison = gather(plan, chosen, by_key, failures)
+    if not comparison.tasks:
+        print("Nothing came through: no report. The same command tries again.", file=sys.stderr)
+        return 1
+    for name, content in make_report(comparison).items():
+        path = plan.out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, content)
+    print(plan.out / "report.html")
+    if failures:
+        print(f"{len(failures)} of {len(jobs)} runs failed: the same command tries them again.", file=sys.stderr)
+    return 1 if failures else 0
+
+
+def check_plan(plan: Plan) -> None:
+    """
+    :param plan: what to compare
+    :raises CommandError: if a name is unknown, or numbers do not go together
+    """
+    known = [algo for algo in rl_zoo3.ALGOS if algo != FLOOR]
+    for option, names in (("--algos", plan.algos), ("--conf", plan.conf)):
+        for name in names:
+            if name not in rl_zoo3.ALGOS:
+                raise CommandError(f"{option}: there is no algorithm {name!r}, but {', '.join(sorted(known))}")
+    for env in plan.envs:
+        make_env(env).close()
+    for env in plan.thresholds:
+        if env not in plan.envs:
+            raise CommandError(f"--threshold: {env!r} is not among {', '.join(plan.envs)}")
+    if plan.steps < plan.eval_points:
+        raise CommandError(f"--steps must be at least --eval-points, {plan.eval_points}; got {plan.steps}")
+
+
+def choose_configurations(plan: Plan, algos: Sequence[str]) -> dict[tuple[str, str], Configuration]:
+    """
+    :param plan: what to compare
+    :param algos: names of algorithms
+    :return: by environment and algorithm that can take its actions, the configuration; each was built once
+    :raises CommandError: if a configuration cannot be read or built, or an algorithm fits no environment
+    """
+    chosen = {}
+    for env in plan.envs:
+        for algo in algos:
+            if not fits(algo, env):
+                continue
+            try:
+                chosen[env, algo] = configuration(algo, env, plan.defaults, plan.conf)
+                with experiment(algo, env, chosen[env, algo].hyperparams, plan.steps, seed=0):
+                    pass
+            except Exception as error:
+                raise CommandError(f"{algo} on {env}: {type(error).__name__}: {error}") from error
+    for algo in algos:
+        if not any(algo == other for _, other in chosen):
+            raise CommandError(f"--algos: {algo} takes the actions of none of {', '.join(plan.envs)}")
+    return chosen
+
+
+def make_job(plan: Plan, env: str, algo: str, seed: int, hyperparams: Mapping[str, Any]) -> Job:
+    """
+    :param plan: what to compare
+    :param env: environment
+    :param algo: name of the algorithm
+    :param seed: seed of the run
+    :param hyperparams: its configuration
+    :return: the job; its name tells all that its result depends on, so that results of several plans can be in one
+        folder
+    """
+    arguments = {
+        "env": env,
+        "algo": algo,
+        "seed": seed,
+        "steps": plan.steps,
+        "hyperparams": hyperparams,
+        "eval_points": plan.eval_points,
+        "eval_episodes": plan.eval_episodes,
+        "packages": list(plan.packages),
+    }
+    digest = hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()[:10]
+    name = "".join(character if character.isalnum() or character in "_-" else "-" for character in env)
+    return Job(f"{name}-{algo}-{seed}-{digest}", run, arguments, is_result)
+
+
+def gather(
+    plan: Plan,
+    chosen: Mapping[tuple[str, str], Configuration],
+    outcomes: Mapping[Key, Outcome],
+    failures: Mapping[str, str],
+) -> Comparison:
+    """
+    :param plan: what was compared
+    :param chosen: the configurations
+    :param outcomes: what became of the runs
+    :param failures: by name of a run that failed, why
+    :return: what there is to report; without an environment on which nothing, or nothing random, came through
+    """
+    tasks = []
+    for env in plan.envs:
+        runs: dict[str, list[Run]] = {}
+        for key, outcome in outcomes.items():
+            if key.env == env and not outcome.error:
+                runs.setdefault(key.algo, []).append(Run(*key, outcome.result))
+        spec = gym.spec(env)
+        if FLOOR in runs:
+            tasks.append(Task(env, runs, plan.thresholds.get(env, spec.reward_threshold)))
+    left_out = [
+        f"{label(algo)} cannot take the actions of {env}."
+        for env in plan.envs
+        for algo in dict.fromkeys(plan.algos)
+        if (env, algo) not in chosen and algo != FLOOR
+    ]
+    return Comparison(
+        tasks,
+        make_groups(tasks),
+        chosen,
+        plan.command,
+        plan.seeds,
+        plan.steps,
+        plan.eval_points,
+        plan.eval_episodes,
+        failures,
+        left_out,
+    )
+
+
+def _local(workers: int | None) -> Backend:
+    return partial(run_locally, workers=workers or usable_cores(), fresh=True, preload=PRELOADED)
+
+
+def _ray(stack: ExitStack, address: str | None, cpus: float, memory: float | None) -> Backend:
+    from sb3_knntd.distributed.ray_jobs import connected, run_on_ray
+
+    try:
+        stack.enter_context(connected(address))
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise CommandError(f"--address: {error}") from error
+    return partial(run_on_ray, cpus=cpus, memory=memory)

@@ -1,0 +1,113 @@
+"""From an environment, an algorithm and its configuration to a model that is ready to learn."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import importlib
+import tempfile
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
+from typing import Any
+
+import rl_zoo3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_knntd.experiments.baselines.random_agent import RandomAgent
+from sb3_knntd.experiments.baselines.tile_sarsa import TileSarsa
+from sb3_knntd.experiments.compare.expressions import as_data
+from sb3_knntd.zoo import register
+from sb3_knntd.zoo.experiment import KNNExperimentManager
+
+#: What a comparison knows besides RL Zoo's algorithms and this package's.
+RIVALS: dict[str, type[BaseAlgorithm]] = {"sarsa": TileSarsa, "random": RandomAgent}
+
+
+def prepare(packages: Sequence[str] = ()) -> None:
+    """
+    Make all algorithms and environments known in this process.
+
+    :param packages: modules that register further environments
+    :raises Exception: whatever importing one of them does, ModuleNotFoundError if it is not there
+    """
+    register()
+    rl_zoo3.ALGOS.update(RIVALS)
+    for package in packages:
+        importlib.import_module(package)
+
+
+class Experiment(KNNExperimentManager):
+    """
+    RL Zoo's experiment, with a configuration that is given and nothing stored.
+
+    :param algo: name of the algorithm
+    :param env_id: environment
+    :param hyperparams: its configuration, in RL Zoo's form
+    :param steps: environment steps, which schedules run over
+    :param seed: seed of the model and its environments
+    :param folder: for what RL Zoo writes
+    """
+
+    def __init__(self, algo: str, env_id: str, hyperparams: dict[str, Any], steps: int, seed: int, folder: str) -> None:
+        super().__init__(
+            argparse.Namespace(),
+            algo,
+            env_id,
+            folder,
+            n_timesteps=steps,
+            eval_freq=-1,
+            seed=seed,
+            verbose=0,
+            device="cpu",
+        )
+        self._given = hyperparams
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
+        """
+        :return: the configuration that was given, to be preprocessed and to be stored
+        :raises ValueError: if it has in it what would have to be run
+        """
+        hyperparams = as_data(copy.deepcopy(self._given)) | {"n_timesteps": self.n_timesteps}
+        self.eval_env_kwargs = hyperparams.get("env_kwargs", {})
+        return hyperparams, OrderedDict(sorted(self._given.items()))
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """
+        :param n_envs: number of environments
+        :param eval_env: whether they are for evaluation
+        :param no_log: not used: a file of episodes would take time that is no part of learning
+        :return: the environments, with the wrappers of the configuration
+        """
+        return super().create_envs(n_envs, eval_env, no_log=True)
+
+
+@contextmanager
+def experiment(
+    algo: str, env_id: str, hyperparams: dict[str, Any], steps: int, seed: int
+) -> Iterator[tuple[Experiment, BaseAlgorithm, list[BaseCallback]]]:
+    """
+    Build what is compared; :func:`prepare` has been called.
+
+    :param algo: name of the algorithm
+    :param env_id: environment
+    :param hyperparams: its configuration, in RL Zoo's form
+    :param steps: environment steps, which schedules run over
+    :param seed: seed of the model and its environments
+    :return: the experiment, its model, and the callbacks that the configuration asks for
+    """
+    # RL Zoo tells on standard output what it reads and builds, and stores it.
+    with tempfile.TemporaryDirectory() as folder:
+        with redirect_stdout(StringIO()):
+            manager = Experiment(algo, env_id, hyperparams, steps, seed, folder)
+            built = manager.setup_experiment()
+        assert built is not None
+        model, _ = built
+        try:
+            yield manager, model, manager.callbacks
+        finally:
+            assert model.env is not None
+            model.env.close()

@@ -1,0 +1,177 @@
+"""One run: an algorithm learns an environment with one seed, and is measured while it does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+
+from sb3_knntd.experiments.compare.experiment import experiment, prepare
+from sb3_knntd.experiments.compare.machine import machine, peak_memory, versions
+
+#: Before the clock starts another model of the same configuration learns for so many steps, or so many seconds: what is
+#: compiled or loaded at its first use is then there. KNNTD may begin to learn after 1000 steps.
+WARM_UP_STEPS = 1100
+WARM_UP_SECONDS = 10.0
+
+
+def run(
+    env: str,
+    algo: str,
+    seed: int,
+    steps: int,
+    hyperparams: dict[str, Any],
+    eval_points: int,
+    eval_episodes: int,
+    packages: Sequence[str] = (),
+) -> dict[str, Any]:
+    """
+    Learn, and measure. Meant for a process of its own: that is what its memory is of.
+
+    :param env: environment
+    :param algo: name of the algorithm
+    :param seed: seed of the model and its environments
+    :param steps: environment steps, over all environments of the configuration together
+    :param hyperparams: its configuration, in RL Zoo's form
+    :param eval_points: how often it is evaluated, equally spaced, the last time after the last step
+    :param eval_episodes: greedy episodes of each evaluation, in environments of their own, whose starts are the same
+        at every point and for every algorithm
+    :param packages: modules that register environments
+    :return: at each point ``steps``, mean ``returns`` and ``stds`` of the episodes, and ``seconds`` of learning so far
+        (evaluation apart); ``cpu_seconds`` of learning; ``start_seconds`` from building the model to having made its
+        first steps; ``base_memory`` before and ``peak_memory`` after, and ``model_size`` as a saved file, bytes;
+        ``versions`` and ``machine``
+    """
+    th.set_num_threads(1)
+    prepare(packages)
+    base_memory = peak_memory()
+    begun = time.perf_counter()
+    with experiment(algo, env, hyperparams, steps, seed) as (_, model, callbacks):
+        model.learn(WARM_UP_STEPS, callback=[*callbacks, WarmUp()])
+    start_seconds = time.perf_counter() - begun
+    with experiment(algo, env, hyperparams, steps, seed) as (manager, model, callbacks):
+        evaluation = manager.create_envs(eval_episodes, eval_env=True)
+        recorder = Recorder(evaluation, steps, eval_points, eval_episodes, seed)
+        model.learn(steps, callback=[*callbacks, recorder])
+        evaluation.close()
+        model_size = saved_size(model)
+    return {
+        "steps": recorder.steps,
+        "returns": recorder.returns,
+        "stds": recorder.stds,
+        "seconds": recorder.seconds,
+        "cpu_seconds": recorder.cpu_seconds,
+        "start_seconds": start_seconds,
+        "base_memory": base_memory,
+        "peak_memory": peak_memory(),
+        "model_size": model_size,
+        "versions": versions(),
+        "machine": machine(),
+    }
+
+
+def is_result(result: Any) -> bool:
+    """
+    :param result: what a file says
+    :return: whether :func:`run` can have returned it
+    """
+    try:
+        points = [result[name] for name in ("steps", "returns", "stds", "seconds")]
+        numbers = [result[n] for n in ("cpu_seconds", "start_seconds", "base_memory", "peak_memory", "model_size")]
+        machine, packages = result["machine"], result["versions"]
+        return (
+            all(isinstance(part, list) and len(part) == len(points[0]) > 0 for part in points)
+            and all(type(number) in (int, float) for part in [numbers, *points] for number in part)
+            and all(number > 0 for number in [*result["steps"], *result["seconds"]])
+            and all(type(version) is str for version in packages.values())
+            and {"processor", "cores", "system"} <= set(machine)
+        )
+    except (TypeError, KeyError, AttributeError):
+        return False
+
+
+def saved_size(model: BaseAlgorithm) -> int:
+    """
+    :param model: any
+    :return: size of the file that it is saved to, bytes
+    """
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "model.zip"
+        model.save(path)
+        return path.stat().st_size
+
+
+class WarmUp(BaseCallback):
+    """Stops learning as soon as what comes later would be like what was."""
+
+    def _on_training_start(self) -> None:
+        self._end = time.perf_counter() + WARM_UP_SECONDS
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps < WARM_UP_STEPS and time.perf_counter() < self._end
+
+
+class Recorder(BaseCallback):
+    """
+    Evaluates at equally spaced points with the clock stopped, and ends learning at the last one.
+
+    :param env: environments for evaluation, with the wrappers of those that are learned from
+    :param total_steps: the last point
+    :param n_points: number of points
+    :param n_episodes: episodes of each evaluation
+    :param seed: of the run, which the starts of the episodes follow from
+    """
+
+    def __init__(self, env: VecEnv, total_steps: int, n_points: int, n_episodes: int, seed: int) -> None:
+        super().__init__()
+        self._env = env
+        self._total_steps, self._n_points, self._n_episodes = total_steps, n_points, n_episodes
+        # Below 2^30, so that adding the number of the environment stays within what seeds may be.
+        self._seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 2)
+        self.steps: list[int] = []
+        self.returns: list[float] = []
+        self.stds: list[float] = []
+        self.seconds: list[float] = []
+        self.cpu_seconds = 0.0
+        self._elapsed = 0.0
+
+    def _on_training_start(self) -> None:
+        self._start_clock()
+
+    def _on_step(self) -> bool:
+        if not self._is_due():
+            return True
+        self._elapsed += time.perf_counter() - self._since
+        self.cpu_seconds += time.process_time() - self._cpu_since
+        # Environments in step can pass several points at once.
+        while self._is_due():
+            self._evaluate()
+        self._start_clock()
+        return len(self.steps) < self._n_points
+
+    def _is_due(self) -> bool:
+        n_done = len(self.steps)
+        return n_done < self._n_points and self.num_timesteps >= self._total_steps * (n_done + 1) // self._n_points
+
+    def _start_clock(self) -> None:
+        self._since, self._cpu_since = time.perf_counter(), time.process_time()
+
+    def _evaluate(self) -> None:
+        training = self.model.get_env()
+        assert training is not None
+        sync_envs_normalization(training, self._env)
+        self._env.seed(self._seed)
+        returns, _ = evaluate_policy(self.model, self._env, self._n_episodes, return_episode_rewards=True)
+        self.steps.append(self.num_timesteps)
+        self.returns.append(float(np.mean(returns)))
+        self.stds.append(float(np.std(returns)))
+        self.seconds.append(self._elapsed)

@@ -1,0 +1,162 @@
+"""The demonstration: train, save, load, evaluate, draw."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_knntd.cli import CommandError, make_env
+from sb3_knntd.common.files import replacing
+from sb3_knntd.exa import ExA
+from sb3_knntd.experiments.baselines.random_agent import RandomPolicy
+from sb3_knntd.knntd import KNNTD
+from sb3_knntd.plots import figure_of, plot_learning_curve, plot_value_function, telling_dims
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+EVAL_EPISODES = 100
+#: Predicting for several environments at once takes hardly longer than for one.
+EVAL_ENVS = 20
+#: Where an environment never cuts an episode, a policy that goes in circles would be evaluated for ever.
+EVAL_STEP_LIMIT = 1000
+#: So that evaluation does not start where training did.
+EVAL_SEED_OFFSET = 1000
+
+
+class StopOnInterrupt:
+    """
+    A callback for ``learn``, and the context it runs in: Ctrl-C ends training in good order after the step in
+    progress, so that the table is whole, and the progress bar gives the terminal back. A second Ctrl-C acts as usual.
+    """
+
+    def __init__(self) -> None:
+        self.interrupted = False
+
+    def __enter__(self) -> StopOnInterrupt:
+        self._previous = signal.signal(signal.SIGINT, self._interrupt)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        signal.signal(signal.SIGINT, self._previous)
+
+    def _interrupt(self, signal_number: int, frame: FrameType | None) -> None:
+        self.interrupted = True
+        signal.signal(signal.SIGINT, self._previous)
+
+    def __call__(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> bool:
+        return not self.interrupted
+
+
+def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
+    """
+    Train KNNTD, or ExA where actions are continuous, save it, load it, evaluate it beside a random policy, draw
+    pictures, and tell on standard output.
+
+    :param env_id: gymnasium id
+    :param steps: number of environment steps to train for
+    :param seed: seed of training; evaluation derives its own from it
+    :param out: folder that all files are written to
+    :return: whether it came to its end; after Ctrl-C during training the model is saved, and no more
+    :raises CommandError: if there is no such environment, neither algorithm takes its spaces, or ``out`` is no
+        folder that can be written to
+    """
+    env = make_env(env_id)
+    algorithm: type[KNNTD | ExA] = ExA if isinstance(env.action_space, spaces.Box) else KNNTD
+    name = algorithm.__name__
+    try:
+        # Before the first file is written: an environment that is refused must not cost an earlier demo's files.
+        algorithm(env)
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    # Named after the environment, so that demos of several can share a folder.
+    stem = f"{name.lower()}_{re.sub(r'[^A-Za-z0-9._-]', '_', env_id)}"
+    files = {"model": out / f"{stem}.zip", "episodes": out / f"{stem}.monitor.csv"}
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        monitored = Monitor(env, str(files["episodes"]))
+    except OSError as error:
+        raise CommandError(f"cannot write to {out}: {error}") from error
+    model = algorithm(monitored, seed=seed, tensorboard_log=str(out / "tensorboard"))
+
+    print(f"Training {name} on {env_id} for {steps:,} steps")
+    start = time.perf_counter()
+    with StopOnInterrupt() as stop:
+        model.learn(steps, callback=stop, progress_bar=True)
+    seconds = time.perf_counter() - start
+    model.save(files["model"])
+    monitored.close()
+    files["TensorBoard log"] = Path(model.logger.get_dir() or out)
+    if stop.interrupted:
+        print(f"Interrupted after {model.num_timesteps:,} of {steps:,} steps. What was learned until then is saved.")
+        _print_files(files)
+        return False
+    print(f"Trained in {seconds:.1f} s. Evaluating the saved model over {EVAL_EPISODES} episodes.")
+
+    step_limit = None if env.spec is not None and env.spec.max_episode_steps else EVAL_STEP_LIMIT
+    eval_env = make_vec_env(
+        env_id,
+        EVAL_ENVS,
+        seed=seed + EVAL_SEED_OFFSET,
+        env_kwargs={} if step_limit is None else {"max_episode_steps": step_limit},
+    )
+    loaded = algorithm.load(files["model"], env=eval_env)
+    learned = _evaluate(loaded, eval_env)
+    eval_env.action_space.seed(seed)
+    random = _evaluate(RandomPolicy(eval_env.observation_space, eval_env.action_space), eval_env)
+    eval_env.close()
+    print()
+    _print_returns(f"Return on {env_id}", {name: learned, "random policy": random})
+    if step_limit is not None:
+        print(f"The environment sets no limit to an episode: these were cut at {step_limit:,} steps.")
+
+    files["learning curve"] = out / f"{stem}_learning_curve.png"
+    axes = plot_learning_curve(
+        np.cumsum(monitored.get_episode_lengths()), monitored.get_episode_rewards(), baseline=float(random.mean())
+    )
+    axes.set_xlim(right=steps)
+    figure_of(axes).suptitle(f"{name} on {env_id}")
+    _save_picture(figure_of(axes), files["learning curve"])
+    if isinstance(loaded.observation_space, spaces.Box) and loaded.observation_space.shape[0] >= 2:
+        files["value function"] = out / f"{stem}_value_function.png"
+        _save_picture(figure_of(plot_value_function(loaded, telling_dims(loaded))[0]), files["value function"])
+    print()
+    _print_files(files)
+    print(f"See the log with: tensorboard --logdir {shlex.quote(str(out / 'tensorboard'))}")
+    return True
+
+
+def _evaluate(policy: PolicyPredictor, env: VecEnv) -> np.ndarray:
+    returns, _ = evaluate_policy(policy, env, EVAL_EPISODES, deterministic=True, return_episode_rewards=True)
+    return np.asarray(returns)
+
+
+def _save_picture(figure: Figure, path: Path) -> None:
+    with replacing(path) as file:
+        figure.savefig(file, format="png")
+
+
+def _print_returns(title: str, returns: dict[str, np.ndarray]) -> None:
+    width = max(map(len, (title, *returns)))
+    print(f"{title:<{width}}  {'mean':>10}  {'std':>10}  {'median':>10}")
+    for name, values in returns.items():
+        print(f"{name:<{width}}  {values.mean():>10.2f}  {values.std():>10.2f}  {np.median(values):>10.2f}")
+
+
+def _print_files(files: dict[str, Path]) -> None:
+    width = max(map(len, files))
+    for name, path in files.items():
+        print(f"{name:<{width}}  {path}")

@@ -1,0 +1,70 @@
+"""The settings of the paper's figures, and models made of them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from importlib.resources import files
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.utils import LinearSchedule
+
+import sb3_knntd.envs  # noqa: F401
+from sb3_knntd.exa import ExA
+from sb3_knntd.knntd import KNNTD
+
+ALGORITHMS: dict[str, type[KNNTD] | type[ExA]] = {"knntd": KNNTD, "exa": ExA}
+#: What the algorithms are called in tables and pictures.
+NAMES = {"knntd": "kNN-TD(λ)", "exa": "Ex⟨a⟩(λ)"}
+
+#: What a setting holds besides arguments of its algorithm.
+OF_THE_EXPERIMENT = ("env", "env_kwargs", "episodes", "filter")
+
+Setting = Mapping[str, Any]
+
+
+def load_settings(figure: str) -> dict[str, dict[str, Setting]]:
+    """
+    :param figure: name of a figure
+    :return: by variant, ``"paper"`` or ``"best"``, and by algorithm, the settings in ``zoo_configs/paper.yml``
+    """
+    import yaml
+
+    settings: dict[str, dict[str, Setting]] = yaml.safe_load(
+        files("sb3_knntd.zoo_configs").joinpath("paper.yml").read_text(encoding="utf-8")
+    )[figure]
+    return settings
+
+
+def make_model(
+    algorithm: str, setting: Setting, seed: int, wrap: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
+) -> KNNTD | ExA:
+    """
+    :param algorithm: ``"knntd"`` or ``"exa"``
+    :param setting: an entry of ``paper.yml``
+    :param seed: seed of the model and its environment
+    :param wrap: puts wrappers around the environment
+    :return: the model, to learn for :func:`total_steps`
+    """
+    arguments = {name: value for name, value in setting.items() if name not in OF_THE_EXPERIMENT}
+    if isinstance(arguments["points"], Mapping):
+        arguments["points"] = np.array(list(itertools.product(*arguments["points"]["grid"])))
+    for name in ("learning_rate", "trace_decay"):
+        schedule = arguments[name]
+        if isinstance(schedule, Mapping):
+            share = schedule["steps"] / total_steps(setting)
+            arguments[name] = LinearSchedule(schedule["start"], schedule["end"], share)
+    env = wrap(gym.make(setting["env"], **setting["env_kwargs"]))
+    return ALGORITHMS[algorithm](env, seed=seed, **arguments)
+
+
+def total_steps(setting: Setting) -> int:
+    """
+    :param setting: an entry of ``paper.yml``
+    :return: number of steps in its episodes if none ends before its time
+    """
+    most = gym.spec(setting["env"]).max_episode_steps
+    assert most is not None
+    return int(setting["episodes"]) * most
