@@ -558,7 +558,7 @@ def test_fresh_processes_end_with_the_program(tmp_path: Path, blow: signal.Signa
     while any((Path("/proc") / path.name.split("-")[1]).exists() for path in pids.iterdir()):
         assert time.monotonic() < end, "a process outlived the program"
         time.sleep(0.05)
-    assert [path.name for path in folder.iterdir()] == ["0.json"]
+    assert [path.name for path in folder.glob("*.json")] == ["0.json"]
 
 
 def test_progress_says_what_runs_and_what_is_left(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
