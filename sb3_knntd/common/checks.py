@@ -6,8 +6,8 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from decimal import Decimal
-from pathlib import Path
 from enum import Enum
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np

@@ -309,7 +309,8 @@ class CompiledLearner(Learner):
         with self.table.lock:
             return {
                 "indices": th.from_numpy(episodes.indices[td.CURRENT].copy()),
-                "probabilities": th.from_numpy(episodes.probabilities[td.CURRENT].copy()),
+                # None while there are no episodes: a state without them is one that has not begun.
+                "probabilities": th.from_numpy(episodes.probabilities[td.CURRENT] * self.in_episodes),
                 "entries": th.from_numpy(episodes.action_indices[td.CURRENT].copy()),
                 "held": th.from_numpy(episodes.persistent.copy()),
                 "lengths": th.from_numpy(episodes.lengths.copy()),

@@ -212,7 +212,8 @@ class TorchLearner(Learner):
     def state_dict(self) -> dict[str, Any]:
         return {
             "indices": self.indices.cpu(),
-            "probabilities": self.probabilities.double().cpu(),
+            # None while there are no episodes: a state without them is one that has not begun.
+            "probabilities": self.probabilities.double().cpu() * self.in_episodes,
             "entries": self.action_indices.cpu(),
             "held": self.persistent.cpu(),
             "lengths": th.from_numpy(self.lengths.copy()),
