@@ -52,7 +52,7 @@ def assert_same(got: Neighbors, expected: Neighbors) -> None:
 
 def compiled_brute(points: Points, k: int, scaled: np.ndarray) -> Neighbors:
     """The search over all points that the compiled step has in it."""
-    columns = fitted("brute", points, k).kernel_arguments()[3]
+    columns = fitted("brute", points, k).kernel_arguments().columns
     indices, distances = np.empty((len(scaled), k), np.int64), np.empty((len(scaled), k))
     for row, x in enumerate(scaled):
         nearest_of_all(x, columns, k, indices[row], distances[row])
