@@ -34,9 +34,10 @@ class KernelWeights(ABC):
         # Inherited, it would have the kernels compute the formula of the parent class.
         weighting = vars(cls).get("WEIGHTING")
         if not isinstance(weighting, Weighting):
+            members = ", ".join(f"Weighting.{member.name}" for member in Weighting)
             raise TypeError(
-                f"{cls.__name__}.WEIGHTING must be a member of Weighting, one of {', '.join(map(str, Weighting))}, and "
-                f"set in the class itself; got {shown(weighting)}. Weights that the kernels do not know are a function"
+                f"{cls.__name__}.WEIGHTING must be set in the class itself, to one of {members}; got "
+                f"{shown(weighting)}. Weights that the kernels do not know can be passed as a function"
             )
 
     def __init__(self, bandwidth: float = 1.0) -> None:
