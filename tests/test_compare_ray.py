@@ -81,8 +81,8 @@ def test_the_backend_does_not_change_what_is_learned(cluster: Cluster, tmp_path:
     arguments += ["--eval-points", "3", "--eval-episodes", "2", "--gym-packages", "compare_envs"]
     assert main([*arguments, "--backend", "ray", "--out", str(tmp_path / "ray")]) == 0
     assert main([*arguments, "--out", str(tmp_path / "local")]) == 0
-    names = sorted(path.name for path in (tmp_path / "ray" / "runs").iterdir())
-    assert names == sorted(path.name for path in (tmp_path / "local" / "runs").iterdir())
+    names = sorted(path.name for path in (tmp_path / "ray" / "runs").glob("*.json"))
+    assert names == sorted(path.name for path in (tmp_path / "local" / "runs").glob("*.json"))
     assert len(names) == 2
     for name in names:
         there, here = (json.loads((tmp_path / where / "runs" / name).read_bytes()) for where in ("ray", "local"))
@@ -112,7 +112,7 @@ def test_a_cluster_elsewhere(cluster: Cluster, tmp_path: Path) -> None:
         )
     finally:
         server.stop(0)
-    assert len(list((tmp_path / "runs").iterdir())) == 2
+    assert len(list((tmp_path / "runs").glob("*.json"))) == 2
     assert (tmp_path / "report.html").exists()
 
 

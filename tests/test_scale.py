@@ -693,3 +693,17 @@ def test_sixty_four_environments_learn_as_stably_as_one() -> None:
             returns.append(mean)
     one, many = np.median(final[1]), np.median(final[64])
     assert many >= one - 0.05 * abs(one)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not pathlib.Path("/proc/self/statm").exists(), reason="reads the memory from /proc")
+def test_memory_is_flat_over_ten_million_steps() -> None:
+    def resident() -> int:
+        return int(pathlib.Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    # Without a Monitor, which keeps the returns of all episodes.
+    model = KNNTD(DummyVecEnv([lambda: gym.make("MountainCar-v0")]), points=20, seed=0)
+    model.learn(100_000)
+    before = resident()
+    model.learn(10**7, reset_num_timesteps=False, log_interval=None)
+    assert resident() - before < 2**21

@@ -23,12 +23,12 @@ class ActionColumns(NamedTuple):
 
     :param points: its action, shape (n_columns, action_dim), action units; in a factored table zero in all but one
         dimension
-    :param blocks: where the columns of each of the action's parts begin, and the end, shape (n_blocks + 1,), int64
+    :param factors: where the columns of each action factor begin, and the end, shape (n_factors + 1,), int64
     :param lists: the action points of each dimension, rising
     """
 
     points: np.ndarray
-    blocks: np.ndarray
+    factors: np.ndarray
     lists: list[np.ndarray]
 
 
@@ -65,11 +65,11 @@ def make_action_columns(action_space: spaces.Box, action_points: Any, action_tab
                 "action_points"
             )
         return ActionColumns(np.array(list(product(*lists))), np.array([0, n_joint]), lists)
-    blocks = np.concatenate(([0], np.cumsum([len(points) for points in lists])))
-    columns = np.zeros((blocks[-1], len(lists)))
+    factors = np.concatenate(([0], np.cumsum([len(points) for points in lists])))
+    columns = np.zeros((factors[-1], len(lists)))
     for dimension, points in enumerate(lists):
-        columns[blocks[dimension] : blocks[dimension + 1], dimension] = points
-    return ActionColumns(columns, blocks, lists)
+        columns[factors[dimension] : factors[dimension + 1], dimension] = points
+    return ActionColumns(columns, factors, lists)
 
 
 def _by_dimension(action_points: Any, action_dim: int) -> list[Any]:

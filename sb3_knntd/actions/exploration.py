@@ -1,10 +1,12 @@
-"""From action values to an action: greedy choice, ties and exploration."""
+"""Exploration of discrete actions: from action values to an action."""
 
 from __future__ import annotations
 
 from typing import ClassVar, Protocol
 
 import torch as th
+
+from sb3_knntd.kernels.selection import Exploration
 
 
 def greedy(values: th.Tensor, ranks: th.Tensor | None = None) -> th.Tensor:
@@ -33,10 +35,12 @@ def pick(uniforms: th.Tensor, n: th.Tensor | int) -> th.Tensor:
     return (uniforms * n).long().clamp(max=n - 1) if isinstance(n, int) else th.minimum((uniforms * n).long(), n - 1)
 
 
-class Exploration(Protocol):
+class ExplorationPolicy(Protocol):
     """A stochastic policy over action values. ``rate`` is ε or the temperature."""
 
-    #: uniform random numbers an action takes
+    #: what the kernels call it
+    CODE: ClassVar[Exploration]
+    #: uniform random numbers that an action takes
     N_UNIFORMS: ClassVar[int]
 
     def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
@@ -61,6 +65,7 @@ class Exploration(Protocol):
 class EpsilonGreedy:
     """A uniformly random action with probability ε, else the best."""
 
+    CODE: ClassVar[Exploration] = Exploration.EPSILON_GREEDY
     N_UNIFORMS: ClassVar[int] = 2
 
     def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
@@ -74,6 +79,7 @@ class EpsilonGreedy:
 class Softmax:
     """An action with probability proportional to exp(Q / temperature)."""
 
+    CODE: ClassVar[Exploration] = Exploration.SOFTMAX
     N_UNIFORMS: ClassVar[int] = 1
 
     def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
@@ -85,4 +91,7 @@ class Softmax:
         return (th.softmax(values / rate, dim=-1) * values).sum(dim=-1)
 
 
-EXPLORATIONS: dict[str, type[EpsilonGreedy] | type[Softmax]] = {"epsilon_greedy": EpsilonGreedy, "softmax": Softmax}
+#: How discrete actions can be explored, by the word that users pass.
+EXPLORATIONS: dict[str, type[ExplorationPolicy]] = {
+    policy.CODE.name.lower(): policy for policy in (EpsilonGreedy, Softmax)
+}

@@ -1,69 +1,111 @@
-"""The action rule: what to do with the values of the neighbours."""
+"""Action selection: from the values of the neighbours to an action, and what the state is worth."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
 
-from sb3_knntd.actions.exploration import Exploration, Softmax, greedy, pick
-from sb3_knntd.kernels.step import (
-    AVERAGE,
-    EACH,
-    EPSILON_GREEDY,
-    EXPECTED_SARSA,
+from sb3_knntd.actions.columns import ActionColumns
+from sb3_knntd.actions.exploration import ExplorationPolicy, greedy, pick
+from sb3_knntd.common.checks import check_member
+from sb3_knntd.kernels.selection import (
     GREEDY,
-    PER_NEIGHBOR,
-    Q_LEARNING,
-    SARSA,
-    SHARED,
-    SOFTMAX,
     UNDRAWN,
+    Combination,
+    Exploration,
+    SelectionArguments,
+    Target,
 )
 
 
-class Choice(NamedTuple):
+class Selection(NamedTuple):
     """
     An action for each row, with what learning needs to know of it.
 
     :param actions: the action: its index, shape (batch,), int64, or a vector, shape (batch, action_dim)
-    :param entries: the columns of the table that each neighbour answers for, one for each of the action's parts,
-        shape (batch, k, n_blocks), int64
-    :param values: what the state is worth as a target, shape (batch,), the table's dtype
+    :param action_indices: the columns of the table that each neighbour selects, one for each action factor, shape
+        (batch, k, n_factors), int64
+    :param target_values: the value of the state as a target, shape (batch,), the table's dtype
     """
 
     actions: th.Tensor
-    entries: th.Tensor
-    values: th.Tensor
+    action_indices: th.Tensor
+    target_values: th.Tensor
 
 
-class ActionRule(ABC):
-    """Chooses from the rows of the neighbours."""
+class ActionSelector(ABC):
+    """
+    Selects actions from the rows of the neighbours. The kernels do the same by :meth:`kernel_arguments`.
 
-    #: uniform random numbers a choice takes
+    :param columns: what each column of the table stands for
+    :param random_ties: whether one of several equal best actions is drawn while training, in place of the first
+    """
+
+    #: uniform random numbers that a selection takes
     n_uniforms: int
-    #: where the columns of each of the action's parts begin, and the end, shape (n_blocks + 1,), int64
-    blocks: np.ndarray
+    _COMBINATION: ClassVar[Combination]
+    #: the exploration whose rate of 0 is the greedy policy
+    _GREEDY_EXPLORATION: ClassVar[Exploration]
+    target = Target.SARSA
+    exploration: Exploration
+    min_persistence = 1.0
+    persistence_share = 0.0
 
-    @abstractmethod
-    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
+    def __init__(self, columns: ActionColumns, random_ties: bool) -> None:
+        self.columns = columns
+        self.random_ties = random_ties
+
+    @property
+    def n_factors(self) -> int:
+        """Number of action factors, each with its own columns of the table."""
+        return len(self.columns.factors) - 1
+
+    @property
+    def rate_is_temperature(self) -> bool:
+        """Whether the rate of exploration is a temperature; if not, it is ε."""
+        return self.exploration is Exploration.SOFTMAX
+
+    @property
+    def factor_ranges(self) -> list[tuple[int, int]]:
+        """The first column of each action factor, and the one after its last."""
+        return list(pairwise(self.columns.factors.tolist()))
+
+    def kernel_arguments(self, greedy: bool = False) -> SelectionArguments:
         """
-        What is being explored, now that a step has passed.
+        :param greedy: whether to leave exploration out and to take the first of equal actions
+        :return: what the kernels need to select in the same way; with ``greedy`` at a rate of 0
+        """
+        return SelectionArguments(
+            combination=int(self._COMBINATION),
+            target=int(self.target),
+            exploration=int(self._GREEDY_EXPLORATION if greedy else self.exploration),
+            random_ties=self.random_ties and not greedy,
+            min_persistence=self.min_persistence,
+            persistence_share=self.persistence_share,
+            factors=self.columns.factors,
+            action_points=self.columns.points,
+        )
 
-        :param held: the columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (batch, n_blocks), int64
+    def persist(self, persistent: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
+        """
+        What is being explored after a further step.
+
+        :param persistent: the columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (batch, n_factors), int64
         :param uniforms: random numbers in [0, 1), shape (batch, n_uniforms)
         :param rate: ε or the temperature
-        :param lengths: how many steps each episode is taken to last, shape (batch,)
-        :return: the same, shape (batch, n_blocks)
+        :param lengths: number of steps that each episode is taken to last, shape (batch,)
+        :return: the same, shape (batch, n_factors)
         """
+        return persistent
 
     @abstractmethod
-    def choose(
-        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, held: th.Tensor
-    ) -> Choice:
+    def select(
+        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, persistent: th.Tensor
+    ) -> Selection:
         """
         The action to take while training.
 
@@ -71,25 +113,85 @@ class ActionRule(ABC):
         :param probabilities: of the neighbours, shape (batch, k), the table's dtype
         :param uniforms: random numbers in [0, 1), shape (batch, n_uniforms)
         :param rate: ε or the temperature
-        :param held: see :meth:`hold`
+        :param persistent: see :meth:`persist`
         """
 
     @abstractmethod
-    def value(self, rows: th.Tensor, probabilities: th.Tensor, entries: th.Tensor) -> th.Tensor:
+    def greedy_indices(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
         """
-        What a state and the action taken in it are worth by the table as it is.
+        The columns that the neighbours select greedily, the first of equal ones.
+
+        :param rows: table rows of the neighbours, shape (batch, k, n_actions)
+        :param probabilities: of the neighbours, shape (batch, k)
+        :return: shape (batch, k, n_factors), int64
+        """
+
+    @abstractmethod
+    def actions_of(self, action_indices: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        """
+        The action that selected columns stand for.
+
+        :param action_indices: shape (batch, k, n_factors), int64
+        :param probabilities: of the neighbours, shape (batch, k)
+        :return: indices of actions, shape (batch,), int64, or vectors, shape (batch, action_dim), action units
+        """
+
+    @abstractmethod
+    def columns_of(self, actions: np.ndarray) -> np.ndarray:
+        """
+        The columns that stand for given actions, or come closest to them.
+
+        :param actions: indices of actions, shape (n,), or vectors, shape (n, action_dim), action units
+        :return: shape (n, n_factors), int64
+        :raises ValueError: if there is no such action
+        """
+
+    @abstractmethod
+    def value(self, rows: th.Tensor, probabilities: th.Tensor, action_indices: th.Tensor) -> th.Tensor:
+        """
+        What a state and the action taken in it are worth by the table as it is (eqs. 8 and 25).
 
         :param rows: table rows of the neighbours, shape (batch, k, n_actions)
         :param probabilities: of the neighbours, shape (batch, k), the table's dtype
-        :param entries: the columns that were answered for, shape (batch, k, n_blocks)
+        :param action_indices: the columns that were selected, shape (batch, k, n_factors)
         :return: shape (batch,)
         """
 
     @abstractmethod
-    def kernel_arguments(self) -> tuple[Any, ...]:
+    def greedy_value(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
         """
-        :return: ``RULE`` of :mod:`sb3_knntd.kernels.desk`
+        What a state is worth if the greedy action is taken (eqs. 12 and 25).
+
+        :param rows: table rows of the neighbours, shape (batch, k, n_actions)
+        :param probabilities: of the neighbours, shape (batch, k)
+        :return: shape (batch,)
         """
+
+    def given_value(self, rows: th.Tensor, probabilities: th.Tensor, columns: th.Tensor) -> th.Tensor:
+        """
+        What a state and one given action for all neighbours are worth.
+
+        :param rows: table rows of the neighbours, shape (batch, k, n_actions)
+        :param probabilities: of the neighbours, shape (batch, k)
+        :param columns: a column for each action factor, shape (batch, n_factors), int64
+        :return: shape (batch,)
+        """
+        values = [
+            (probabilities * rows.gather(2, columns[:, None, factor, None].expand(*rows.shape[:2], 1))[..., 0]).sum(1)
+            for factor in range(columns.shape[1])
+        ]
+        return th.stack(values).mean(dim=0)
+
+    def random_columns(self, uniforms: np.ndarray) -> np.ndarray:
+        """
+        Columns drawn at random.
+
+        :param uniforms: random numbers in [0, 1), shape (batch, n_factors)
+        :return: a column for each action factor, shape (batch, n_factors), int64
+        """
+        factors = self.columns.factors
+        drawn: np.ndarray = factors[:-1] + (uniforms * np.diff(factors)).astype(np.int64)
+        return drawn
 
 
 def mean_rows(rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
@@ -103,133 +205,152 @@ def mean_rows(rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
     return (probabilities[..., None] * rows).sum(dim=1)
 
 
-def mean_actions(entries: th.Tensor, probabilities: th.Tensor, action_points: th.Tensor) -> th.Tensor:
+class MeanValueSelector(ActionSelector):
     """
-    The mean of what the neighbours recommend (eq. 21).
+    kNN-TD: the neighbours' values are averaged, and one action is selected from the mean (eqs. 8 to 12).
 
-    :param entries: the columns they recommend, shape (batch, k, n_blocks)
-    :param probabilities: of the neighbours, shape (batch, k)
-    :param action_points: the action of each column, shape (n_actions, action_dim)
-    :return: shape (batch, action_dim)
-    """
-    return (probabilities[..., None] * action_points[entries].sum(dim=2)).sum(dim=1)
-
-
-class DiscreteRule(ActionRule):
-    """
-    kNN-TD's rule: the neighbours' values are averaged, and one action is chosen from the average
-    (eqs. 8 to 12).
-
-    :param n_actions: number of actions
-    :param target: ``"sarsa"`` (eq. 11), ``"q_learning"`` (eq. 12) or ``"expected_sarsa"``
+    :param columns: one for each action
+    :param target: the value of the next state
     :param exploration: the policy while training
-    :param random_ties: whether equal best actions are drawn from while training
+    :param random_ties: whether one of several equal best actions is drawn while training, in place of the first
     """
 
-    def __init__(self, n_actions: int, target: str, exploration: Exploration, random_ties: bool) -> None:
+    _COMBINATION = Combination.OF_VALUES
+    _GREEDY_EXPLORATION = Exploration.EPSILON_GREEDY
+
+    def __init__(
+        self, columns: ActionColumns, target: Target, exploration: ExplorationPolicy, random_ties: bool
+    ) -> None:
+        super().__init__(columns, random_ties)
         self.target = target
-        self.exploration = exploration
-        self.random_ties = random_ties
+        self.policy = exploration
+        self.exploration = exploration.CODE
         self.n_uniforms = exploration.N_UNIFORMS
-        self.blocks = np.array([0, n_actions])
 
-    def kernel_arguments(self) -> tuple[Any, ...]:
-        target = {"sarsa": SARSA, "q_learning": Q_LEARNING, "expected_sarsa": EXPECTED_SARSA}[self.target]
-        exploration = SOFTMAX if isinstance(self.exploration, Softmax) else EPSILON_GREEDY
-        return AVERAGE, target, exploration, self.random_ties, 1.0, 0.0, self.blocks, np.empty((0, 0))
-
-    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
-        return held
-
-    def choose(
-        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, held: th.Tensor
-    ) -> Choice:
+    def select(
+        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, persistent: th.Tensor
+    ) -> Selection:
         values = mean_rows(rows, probabilities)
-        actions = self.exploration.choose(values, uniforms, rate, self.random_ties)
-        if self.target == "sarsa":
-            worth = values.gather(1, actions[:, None])[:, 0]
-        elif self.target == "q_learning":
-            worth = values.amax(dim=1)
+        actions = self.policy.choose(values, uniforms, rate, self.random_ties)
+        if self.target is Target.SARSA:
+            target_values = values.gather(1, actions[:, None])[:, 0]
+        elif self.target is Target.Q_LEARNING:
+            target_values = values.amax(dim=1)
+        elif self.target is Target.EXPECTED_SARSA:
+            target_values = self.policy.expectation(values, rate)
         else:
-            worth = self.exploration.expectation(values, rate)
-        return Choice(actions, actions[:, None, None].expand(*probabilities.shape, 1), worth)
+            raise ValueError(f"there is no target {self.target!r}")
+        return Selection(actions, actions[:, None, None].expand(*probabilities.shape, 1), target_values)
 
-    def value(self, rows: th.Tensor, probabilities: th.Tensor, entries: th.Tensor) -> th.Tensor:
-        return (probabilities * rows.gather(2, entries)[..., 0]).sum(dim=1)
+    def greedy_indices(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        return greedy(mean_rows(rows, probabilities))[:, None, None].expand(*probabilities.shape, 1)
+
+    def actions_of(self, action_indices: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        return action_indices[:, 0, 0]
+
+    def columns_of(self, actions: np.ndarray) -> np.ndarray:
+        columns = np.asarray(actions)
+        n_actions = int(self.columns.factors[-1])
+        if columns.ndim != 1 or not np.issubdtype(columns.dtype, np.integer):
+            raise ValueError(f"actions must be integers of shape (n,); got {columns.dtype}, shape {columns.shape}")
+        if len(columns) and not 0 <= columns.min() <= columns.max() < n_actions:
+            raise ValueError(f"actions must be from 0 to {n_actions - 1}; got {columns.min()} to {columns.max()}")
+        return columns[:, None].astype(np.int64)
+
+    def value(self, rows: th.Tensor, probabilities: th.Tensor, action_indices: th.Tensor) -> th.Tensor:
+        return (probabilities * rows.gather(2, action_indices)[..., 0]).sum(dim=1)
+
+    def greedy_value(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        return mean_rows(rows, probabilities).amax(dim=1)
 
 
-class ContinuousRule(ActionRule):
+class MeanActionSelector(ActionSelector):
     """
-    Ex⟨a⟩'s rule: each neighbour recommends the best action of its own row, and the recommendations are averaged
-    (eqs. 19 to 21). What the state is worth is the mean of the neighbours' best values (eq. 25).
+    Ex⟨a⟩: each neighbour selects the best action of its own row, and the mean of these actions is taken (eqs. 19 to 21).
+    The state is worth the mean of the neighbours' best values (eq. 25).
 
-    :param action_points: the action of each column, shape (n_actions, action_dim), action units
-    :param blocks: where the columns of each of the action's parts begin, and the end, shape (n_blocks + 1,)
-    :param shared: whether all neighbours explore the same column together, or each by itself (eq. 27)
-    :param least_hold: for how many steps in the mean a draw of whether and what to explore together is held
-    :param hold_share: or for this share of an episode, if that is longer
+    :param columns: the action points, in columns for each action factor
+    :param exploration: ``SHARED``: all neighbours explore the same column; ``PER_NEIGHBOR``: each by itself (eq. 27)
+    :param min_persistence: mean number of steps, at least, for which a shared draw is kept
+    :param persistence_share: or this share of an episode, if that is longer
     :param n_neighbors: k
-    :param random_ties: whether equal best columns are drawn from while training
+    :param random_ties: whether one of several equal best columns is drawn while training, in place of the first
     """
+
+    _COMBINATION = Combination.OF_ACTIONS
+    _GREEDY_EXPLORATION = Exploration.SHARED
 
     def __init__(
         self,
-        action_points: np.ndarray,
-        blocks: np.ndarray,
-        shared: bool,
-        least_hold: float,
-        hold_share: float,
+        columns: ActionColumns,
+        exploration: Exploration,
+        min_persistence: float,
+        persistence_share: float,
         n_neighbors: int,
         random_ties: bool,
     ) -> None:
-        self.action_points = action_points
-        self.blocks = blocks
-        self.shared = shared
-        self.least_hold = float(least_hold)
-        self.hold_share = float(hold_share)
-        self.random_ties = random_ties
-        n_blocks = len(blocks) - 1
-        #: redraw, explore, column of each block, tie of each neighbour and block, and whether each explores
-        self._parts = [1, 1, n_blocks, n_neighbors * n_blocks, 0 if shared else n_neighbors * n_blocks]
+        super().__init__(columns, random_ties)
+        self.exploration = check_member("exploration", exploration, (Exploration.SHARED, Exploration.PER_NEIGHBOR))
+        self.min_persistence = float(min_persistence)
+        self.persistence_share = float(persistence_share)
+        n_factors, shared = self.n_factors, exploration is Exploration.SHARED
+        #: redraw, explore, column of each factor, tie of each neighbour and factor, and whether each of these explores
+        self._parts = [1, 1, n_factors, n_neighbors * n_factors, 0 if shared else n_neighbors * n_factors]
         self.n_uniforms = sum(self._parts)
+        self._points = th.from_numpy(columns.points)
 
-    def kernel_arguments(self) -> tuple[Any, ...]:
-        exploration = SHARED if self.shared else PER_NEIGHBOR
-        hold = self.least_hold, self.hold_share
-        return EACH, SARSA, exploration, self.random_ties, *hold, self.blocks, self.action_points
-
-    def hold(self, held: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
-        if not self.shared:
-            return held
+    def persist(self, persistent: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
+        if self.exploration is not Exploration.SHARED:
+            return persistent
         redraw, explore, columns, *_ = uniforms.split(self._parts, dim=1)
-        drawn = [
-            first + pick(columns[:, block], end - first)
-            for block, (first, end) in enumerate(pairwise(self.blocks.tolist()))
-        ]
+        drawn = [first + pick(columns[:, f], end - first) for f, (first, end) in enumerate(self.factor_ranges)]
         fresh = th.where(explore < rate, th.stack(drawn, dim=1), GREEDY)
-        steps = (self.hold_share * lengths).clamp(min=self.least_hold)
-        return th.where((held[:, :1] == UNDRAWN) | (redraw * steps[:, None] < 1.0), fresh, held)
+        steps = (self.persistence_share * lengths).clamp(min=self.min_persistence)
+        return th.where((persistent[:, :1] == UNDRAWN) | (redraw * steps[:, None] < 1.0), fresh, persistent)
 
-    def choose(
-        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, held: th.Tensor
-    ) -> Choice:
+    def select(
+        self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, persistent: th.Tensor
+    ) -> Selection:
         batch, k, _ = rows.shape
         _, _, _, ties, explore = uniforms.split(self._parts, dim=1)
         ties = ties.reshape(batch, k, -1)
-        entries = []
-        for block, (first, end) in enumerate(pairwise(self.blocks.tolist())):
-            part = rows[..., first:end]
-            entry = first + greedy(part, ties[..., block] if self.random_ties else None)
-            if self.shared:
-                entry = th.where(held[:, block, None] >= 0, held[:, block, None], entry)
+        selected = []
+        for factor, (first, end) in enumerate(self.factor_ranges):
+            column = first + greedy(rows[..., first:end], ties[..., factor] if self.random_ties else None)
+            if self.exploration is Exploration.SHARED:
+                column = th.where(persistent[:, factor, None] >= 0, persistent[:, factor, None], column)
             else:
-                drawn = first + pick(ties[..., block], end - first)
-                entry = th.where(explore.reshape(batch, k, -1)[..., block] < rate, drawn, entry)
-            entries.append(entry)
-        chosen = th.stack(entries, dim=2)
-        points = th.from_numpy(self.action_points).to(probabilities)
-        return Choice(mean_actions(chosen, probabilities, points), chosen, self.value(rows, probabilities, chosen))
+                drawn = first + pick(ties[..., factor], end - first)
+                column = th.where(explore.reshape(batch, k, -1)[..., factor] < rate, drawn, column)
+            selected.append(column)
+        action_indices = th.stack(selected, dim=2)
+        actions = self.actions_of(action_indices, probabilities)
+        return Selection(actions, action_indices, self.greedy_value(rows, probabilities))
 
-    def value(self, rows: th.Tensor, probabilities: th.Tensor, entries: th.Tensor) -> th.Tensor:
-        best = [rows[..., first:end].amax(dim=-1) for first, end in pairwise(self.blocks.tolist())]
+    def greedy_indices(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        return th.stack([first + greedy(rows[..., first:end]) for first, end in self.factor_ranges], dim=2)
+
+    def actions_of(self, action_indices: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        points = self._points.to(probabilities)
+        return (probabilities[..., None] * points[action_indices].sum(dim=2)).sum(dim=1)
+
+    def columns_of(self, actions: np.ndarray) -> np.ndarray:
+        vectors, points = np.asarray(actions, dtype=np.float64), self.columns.points
+        if vectors.ndim != 2 or vectors.shape[1] != points.shape[1] or not np.isfinite(vectors).all():
+            raise ValueError(
+                f"actions must be finite and of shape (n, {points.shape[1]}); got shape {vectors.shape}"
+            )
+        nearest = []
+        for factor, (first, end) in enumerate(self.factor_ranges):
+            # A factored table has a factor for each dimension of the action.
+            dims = slice(None) if self.n_factors == 1 else slice(factor, factor + 1)
+            distances = (vectors[:, None, dims] - points[None, first:end, dims]) ** 2
+            nearest.append(first + distances.sum(axis=2).argmin(axis=1))
+        return np.stack(nearest, axis=1).astype(np.int64)
+
+    def value(self, rows: th.Tensor, probabilities: th.Tensor, action_indices: th.Tensor) -> th.Tensor:
+        return self.greedy_value(rows, probabilities)
+
+    def greedy_value(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        best = [rows[..., first:end].amax(dim=-1) for first, end in self.factor_ranges]
         return (probabilities * th.stack(best, dim=2).mean(dim=2)).sum(dim=1)

@@ -7,9 +7,12 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from enum import Enum
+from typing import Any, TypeVar
 
 import numpy as np
+
+Member = TypeVar("Member", bound=Enum)
 
 #: The least number that is taken where one is to be above 0 and is divided by: its square and quotients stay numbers.
 LEAST = 1e-100
@@ -45,6 +48,20 @@ def check_word(name: str, value: Any, words: Iterable[str]) -> None:
     allowed = list(words)
     if not isinstance(value, str) or value not in allowed:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}; got {shown(value)}")
+
+
+def check_member(name: str, value: Any, members: Iterable[Member]) -> Member:
+    """
+    :param name: name of the argument
+    :param value: a member of an enumeration, or its name in lower case
+    :param members: what is allowed
+    :return: the member
+    :raises ValueError: if ``value`` is none of ``members``
+    """
+    words = {member.name.lower(): member for member in members}
+    word = value.name.lower() if isinstance(value, Enum) else value
+    check_word(name, word, words)
+    return words[word]
 
 
 def check_flag(name: str, value: Any) -> bool:

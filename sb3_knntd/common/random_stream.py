@@ -59,9 +59,10 @@ class RandomStream:
         self._fill(self._number + 1)
 
     def _fill(self, number: int) -> None:
-        self._number = number
         bits = np.random.Philox(key=self._key, counter=[0, 0, number, 0])
+        # In this order an interruption leaves a block of which all rows have been taken, and that is filled again.
         np.random.Generator(bits).random(out=self.rows)
+        self._number = number
         self.taken[0] = 0
 
     def state(self) -> dict[str, Any]:

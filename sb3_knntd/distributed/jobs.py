@@ -172,6 +172,8 @@ def run_locally(
                 (job, attempt), worker = waiting.popleft(), idle.pop()
                 with _environment(ONE_THREAD), _interrupts_held():  # a worker starts with its first job
                     running[worker.submit(compute, job)] = job, attempt, worker
+                # The worker alone has the other end now: if it dies in the middle of an answer, that is its end.
+                worker._result_queue._writer.close()  # type: ignore[attr-defined]
                 yield job, None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, attempt, worker = running.pop(future)

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+from functools import cache, partial
+
 import numpy as np
 
 from sb3_knntd.kernels.jit import inlined, jit
-from sb3_knntd.kernels.perceive import perceive
+from sb3_knntd.kernels.perceive import SearchKind, perceive
 from sb3_knntd.kernels.selection import (
     UNDRAWN,
     Combination,
     Exploration,
     count_steps,
+    greedy_and_given_value,
     largest,
     persist,
     select,
 )
+from sb3_knntd.kernels.state import address_of, state_at
 from sb3_knntd.kernels.traces import (
+    LARGEST_VALUE,
     LEAST_CLOCK,
     activate,
     active_value,
     end_episode,
     find,
     flush,
+    largest_size,
     read_active_row,
     set_trace,
 )
@@ -30,9 +36,10 @@ from sb3_knntd.kernels.traces import (
 CURRENT, NEXT, TERMINAL = 0, 1, 2
 
 
-#: Outcomes of a step: done; more random numbers or more rows are needed; or what the environments returned, or what the
-#: table would become, is not finite. Plain numbers: an enumeration's member takes half a microsecond to hand back.
-OK, NEED_RANDOM, NEED_CAPACITY, NOT_FINITE, DIVERGED = range(5)
+#: Outcomes of a step: done; more random numbers or more rows are needed; a rate is out of range, or what the environments
+#: returned is not finite, or values would become too large. Plain numbers: an enumeration's member takes half a
+#: microsecond to hand back.
+OK, NEED_RANDOM, NEED_CAPACITY, BAD_RATE, NOT_FINITE, DIVERGED = range(6)
 
 
 @jit
@@ -75,6 +82,23 @@ def begin(state, observations, uniforms, rate):
 
 
 @inlined
+def _stay_small(change, trace_decay, state):
+    """
+    Whether no value can become larger than ``LARGEST_VALUE``, with each entry changed by at most ``change`` times its
+    trace. Looking at all entries is for the rare case that their known bound does not tell.
+    """
+    trace_bound = state.trace_bound[0] + 1.0 if state.accumulating else 1.0
+    bound = state.value_bound[0] + change * trace_bound
+    if not bound <= LARGEST_VALUE:
+        bound = largest_size(state, state) + change * trace_bound
+        if not bound <= LARGEST_VALUE:
+            return False
+    state.value_bound[0] = bound
+    state.trace_bound[0] = trace_bound * state.gamma * trace_decay
+    return True
+
+
+@inlined
 def update_table(state, target_values, rewards, ended, learning_rate, trace_decay):
     """
     Compute the TD errors of the steps from the ``CURRENT`` states, and credit them along the traces (Algorithm 3), in all
@@ -93,7 +117,7 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
     places, corrections, row, factors = state.places, state.corrections, state.row, state.factors
     entries, slots, clock = state.active_entries, state.active_slots, state.clock
     n_envs, k, n_factors = chosen.shape
-    size, value_sum = 0.0, 0.0
+    size, value_sum, change = 0.0, 0.0, 0.0
     for env in range(n_envs):
         value, squares = 0.0, 0.0
         for i in range(k):
@@ -115,7 +139,10 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
         if not np.isfinite(corrections[env]):
             return DIVERGED
         size += abs(error)
+        change += abs(corrections[env])
         value_sum += value
+    if not _stay_small(change, trace_decay, state):
+        return DIVERGED
 
     for env in range(n_envs):
         for i in range(k):
@@ -136,6 +163,8 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
     for env in range(n_envs):
         if ended[env]:
             end_episode(env, state, state)
+    if state.n_active[0] == 0:
+        state.trace_bound[0] = 0.0
     if clock[0] < LEAST_CLOCK:
         flush(state, state)
     state.sums[0] += size
@@ -175,6 +204,14 @@ def has_capacity(state):
     return len(state.row_slots) == 0 or len(state.values) - state.n_rows[0] >= most
 
 
+@inlined
+def _are_valid(learning_rate, trace_decay, rate, state):
+    """Whether scheduled parameters are in range; not a number never is."""
+    if not (0.0 <= learning_rate < np.inf and 0.0 <= trace_decay <= 1.0):
+        return False
+    return 0.0 < rate < np.inf if state.exploration == Exploration.SOFTMAX else 0.0 <= rate <= 1.0
+
+
 @jit
 def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate):
     """
@@ -187,14 +224,16 @@ def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate)
     :param learning_rate: α
     :param trace_decay: λ
     :param rate: ε or the temperature
-    :return: ``OK``; or ``NEED_RANDOM`` or ``NEED_CAPACITY``, and then nothing has been done; or ``NOT_FINITE`` or
-        ``DIVERGED``, and then no value has been changed
+    :return: ``OK``; or ``NEED_RANDOM``, ``NEED_CAPACITY`` or ``BAD_RATE``, and then nothing has been done; or
+        ``NOT_FINITE`` or ``DIVERGED``, and then no value has been changed
     """
     target_values = state.target_values
     if state.n_taken[0] == len(state.rows):
         return NEED_RANDOM
     if not has_capacity(state):
         return NEED_CAPACITY
+    if not _are_valid(learning_rate, trace_decay, rate, state):
+        return BAD_RATE
     uniforms = state.rows[state.n_taken[0]]
     state.n_taken[0] += 1
     count_steps(state.lengths, ended)
@@ -218,8 +257,6 @@ def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate)
     return outcome
 
 
-from functools import cache, partial
-from sb3_knntd.kernels.state import place_of, state_at
 @cache
 def _learn_at(kind):
     @jit
@@ -229,6 +266,101 @@ def _learn_at(kind):
     return learn_at
 
 
-def learn_on(desk):
-    address, kind = place_of(desk)
+def learn_with(state):
+    """
+    :param state: see :mod:`sb3_knntd.kernels.state`; to be kept for as long as the function is
+    :return: :func:`learn` with this state, a function of its other arguments
+    """
+    address, kind = address_of(state)
     return partial(_learn_at(kind), address)
+
+
+@jit
+def recommend(state, observations, uniforms, indices, probabilities, action_indices):
+    """
+    The columns that the neighbours select greedily in each of a batch of states.
+
+    :param state: with greedy selection, see :mod:`sb3_knntd.kernels.state`
+    :param observations: observation units, shape (batch, obs_dim)
+    :param uniforms: zeros, shape (n_uniforms,)
+    :param indices: to be filled, or with search ``OUTSIDE`` given, shape (batch, k), int64
+    :param probabilities: to be filled, shape (batch, k); with search ``OUTSIDE`` the squared distances are given in it
+    :param action_indices: to be filled, shape (batch, k, n_factors), int64
+    """
+    for row in range(len(observations)):
+        perceive(observations[row], state, indices[row], probabilities[row])
+        select(
+            indices[row],
+            probabilities[row],
+            uniforms,
+            0.0,
+            state.persistent[0],
+            state,
+            action_indices[row],
+            state.actions[CURRENT, 0],
+        )
+
+
+@jit
+def update(
+    state,
+    observations,
+    columns,
+    rewards,
+    next_observations,
+    terminated,
+    ended,
+    found,
+    distances,
+    first,
+    learning_rate,
+    trace_decay,
+):
+    """
+    Learn from given transitions, one after the other, by Watkins's Q(λ): the target is the value of the greedy action,
+    and traces are cut before an action that is not greedy (Watkins 1989; Sutton and Barto, 2nd ed., section 12.10).
+
+    :param state: of one environment, see :mod:`sb3_knntd.kernels.state`
+    :param observations: observation units, shape (n, obs_dim)
+    :param columns: the actions, a column for each factor, shape (n, n_factors), int64
+    :param rewards: shape (n,)
+    :param next_observations: observation units, shape (n, obs_dim)
+    :param terminated: whether the next state is terminal, shape (n,), bool
+    :param ended: whether the next transition does not go on from this one, shape (n,), bool
+    :param found: with search ``OUTSIDE`` the neighbours before and after, shape (2, n, k), int64; else not used
+    :param distances: with search ``OUTSIDE`` their squared distances, shape (2, n, k); else not used
+    :param first: number of the transition to begin with
+    :param learning_rate: α
+    :param trace_decay: λ
+    :return: how many transitions have been learned from, and ``OK``, ``NEED_CAPACITY`` or ``DIVERGED``
+    """
+    target_values, last = state.target_values, np.empty(1, np.bool_)
+    reward = np.empty(1)
+    goes_on = first > 0 and not ended[first - 1]
+    for t in range(first, len(rewards)):
+        if not has_capacity(state):
+            return t, NEED_CAPACITY
+        for which in (CURRENT, NEXT):
+            indices, probabilities = state.indices[which, 0], state.probabilities[which, 0]
+            if state.search == SearchKind.OUTSIDE:
+                indices[:] = found[which, t]
+                probabilities[:] = distances[which, t]
+            perceive(observations[t] if which == CURRENT else next_observations[t], state, indices, probabilities)
+        indices, probabilities = state.indices[CURRENT, 0], state.probabilities[CURRENT, 0]
+        greedy, given = greedy_and_given_value(indices, probabilities, columns[t], state)
+        if goes_on and given < greedy:
+            end_episode(0, state, state)
+            state.trace_bound[0] = 0.0
+        for i in range(len(indices)):
+            state.action_indices[CURRENT, 0, i] = columns[t]
+        target_values[0] = 0.0
+        if not terminated[t]:
+            target_values[0], _ = greedy_and_given_value(
+                state.indices[NEXT, 0], state.probabilities[NEXT, 0], columns[t], state
+            )
+        reward[0], last[0] = rewards[t], ended[t]
+        outcome = update_table(state, target_values, reward, last, learning_rate, trace_decay)
+        if outcome != OK:
+            return t, outcome
+        goes_on = not ended[t]
+    return len(rewards), OK

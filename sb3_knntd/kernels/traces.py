@@ -28,6 +28,8 @@ LEAST_TRACE = 1e-18
 #: When c falls below this, all values are brought up to date and c starts at 1: x grows as 1/c, and digits are lost
 #: with it.
 LEAST_CLOCK = 1e-4
+#: Values larger than this have diverged. It leaves room for sums of them, in float32 as well.
+LARGEST_VALUE = 1e30
 
 
 class TableArrays(NamedTuple):
@@ -210,6 +212,31 @@ def write_back(table, traces):
         row = row_of(traces.active_points[place], table.row_slots)
         for action in range(traces.active_entries.shape[1]):
             table.values[row, action] = active_value(traces.active_entries, place, action, traces.clock)
+
+
+@jit
+def largest_size(table, traces):
+    """The largest size that a value of the table has."""
+    values, clock, largest = table.values, traces.clock, 0.0
+    n_rows = len(values) if len(table.row_slots) == 0 else table.n_rows[0]
+    for row in range(n_rows):
+        for action in range(values.shape[1]):
+            largest = max(largest, abs(values[row, action]))
+    for place in range(traces.n_active[0]):
+        for action in range(values.shape[1]):
+            largest = max(largest, abs(active_value(traces.active_entries, place, action, clock)))
+    return largest
+
+
+@jit
+def adopt(table, traces):
+    """Have the active points take over the values that the table has for them; their traces stay."""
+    entries, clock = traces.active_entries, traces.clock
+    for place in range(traces.n_active[0]):
+        row = row_of(traces.active_points[place], table.row_slots)
+        for action in range(entries.shape[1]):
+            change = table.values[row, action] - active_value(entries, place, action, clock)
+            entries[place, action, entries.shape[2] - 1] += change
 
 
 @jit

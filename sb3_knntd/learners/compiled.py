@@ -1,4 +1,4 @@
-"""The step as one compiled call over the memory of the torch tensors."""
+"""The learning step as one compiled call over the memory of the torch tensors."""
 
 from __future__ import annotations
 
@@ -8,185 +8,370 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_knntd.actions.selection import ActionRule
+from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.random_stream import RandomStream
-from sb3_knntd.kernels import step as kernel
-from sb3_knntd.kernels.desk import set_desk
-from sb3_knntd.kernels.step import FINE, FULL, USED_UP
-from sb3_knntd.learners.base import DIVERGENCE, Form, Learner, Rates, check_finite, check_transition
+from sb3_knntd.common.transitions import check_finite, check_transition
+from sb3_knntd.kernels import td
+from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination, SelectionArguments
+from sb3_knntd.kernels.state import EpisodeArrays, RandomRows, UpdateConfig, WorkArrays, make_state
+from sb3_knntd.kernels.traces import adopt, write_back
+from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, update_rates
 from sb3_knntd.perception import Perceiver
-from sb3_knntd.q_table import LiveStore, QTable
+from sb3_knntd.q_table import ActiveTraces, QTable
 
 FLOAT32 = np.dtype(np.float32)
-#: What holds addresses of arrays, or looks into them: a copy of the learner makes its own.
-OF_THE_DESK = {"_lent", "_desk", "_learn", "_actions"}
+
+
+class Workplace:
+    """
+    The arrays that a kernel works on, as one state that follows perception and table when these change.
+
+    :param perceiver: with weights that are known to the kernels
+    :param table: the Q-table, on the CPU
+    :param selection: how actions are selected
+    :param n_envs: number of environments
+    :param n_uniforms: random numbers that a selection takes
+    :param config: which form the update has
+    :param traces: the eligibility traces; ``None`` for those that the table has
+    :param stream: rows of random numbers, shape (n_envs, 2, n_uniforms); ``None`` if none are needed
+    """
+
+    def __init__(
+        self,
+        perceiver: Perceiver,
+        table: QTable,
+        selection: SelectionArguments,
+        n_envs: int,
+        config: UpdateConfig,
+        traces: ActiveTraces | None = None,
+        stream: RandomStream | None = None,
+    ) -> None:
+        self.perceiver = perceiver
+        self.table = table
+        self.selection = selection
+        self.config = config
+        self.traces = traces
+        self.stream = stream
+        k, n_factors, n_actions = perceiver.search.n_neighbors, len(selection.factors) - 1, table.n_actions
+        self.episodes = EpisodeArrays(
+            indices=np.zeros((3, n_envs, k), np.int64),
+            probabilities=np.zeros((3, n_envs, k)),
+            action_indices=np.zeros((3, n_envs, k, n_factors), np.int64),
+            actions=np.zeros((3, n_envs, selection.action_points.shape[1])),
+            truncated=np.zeros(n_envs, np.bool_),
+            last_observations=np.zeros((n_envs, perceiver.bounds.obs_dim)),
+            persistent=np.full((n_envs, n_factors), UNDRAWN),
+            lengths=np.zeros(1 + n_envs),
+        )
+        self.work = WorkArrays(
+            means=np.zeros(n_actions),
+            row=np.zeros(n_actions),
+            target_values=np.zeros(n_envs),
+            corrections=np.zeros(n_envs),
+            places=np.zeros((n_envs, k), np.int64),
+            sums=np.zeros(3),
+            value_bound=np.full(1, np.inf),
+            trace_bound=np.zeros(1),
+        )
+        self.bind()
+
+    def bind(self) -> None:
+        """Take in perception and table as they are now."""
+        self.versions = self.perceiver.version, self.table.version
+        perception = self.perceiver.arguments
+        assert perception is not None
+        traces = self.traces or self.table.traces
+        no_rows = RandomRows(np.empty((0, 0, 0, 0)), np.zeros(1, np.int64))
+        random = no_rows if self.stream is None else RandomRows(self.stream.rows, self.stream.taken)
+        # Values that are new are not known to be small, nor traces.
+        self.work.value_bound[0] = np.inf
+        groups = (
+            perception,
+            self.selection,
+            self.config,
+            self.table.arrays(),
+            traces.arrays,
+            self.episodes,
+            random,
+            self.work,
+        )
+        # The state does not keep its arrays.
+        self._lent = groups
+        self.state = make_state(*groups)
+
+    def follow(self) -> bool:
+        """
+        Take in perception and table if they have changed.
+
+        :return: whether they have
+        """
+        if self.versions == (self.perceiver.version, self.table.version):
+            return False
+        self.bind()
+        return True
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name not in ("_lent", "state")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.bind()
 
 
 class CompiledLearner(Learner):
     """
-    The same answers as :class:`~sb3_knntd.learners.base.TorchLearner`, on the CPU, in microseconds.
+    The same answers as :class:`~sb3_knntd.learners.reference.TorchLearner`, on the CPU, in microseconds.
 
-    :param perceiver: where am I? With weights that are known to the kernels
-    :param table: what is it worth?
-    :param rule: what do I do?
-    :param stream: rows of random numbers, shape (n_envs, 2, rule.n_uniforms)
+    :param perceiver: with weights that are known to the kernels
+    :param table: the Q-table
+    :param selector: selects actions
+    :param stream: rows of random numbers, shape (n_envs, 2, selector.n_uniforms)
     :param n_envs: number of environments
-    :param form: which of the update's forms
+    :param config: which form the update has
     """
 
     def __init__(
-        self, perceiver: Perceiver, table: QTable, rule: ActionRule, stream: RandomStream, n_envs: int, form: Form
+        self,
+        perceiver: Perceiver,
+        table: QTable,
+        selector: ActionSelector,
+        stream: RandomStream,
+        n_envs: int,
+        config: UpdateConfig,
     ) -> None:
-        self.perceiver = perceiver
-        self.table = table
+        super().__init__(perceiver, table, selector, n_envs, config)
         self.stream = stream
-        self.n_envs = n_envs
-        self.live = LiveStore(table, n_envs)
-        self._rule = rule.kernel_arguments()
-        self._form = tuple(form)
-        k, obs_dim = perceiver.search.n_neighbors, perceiver.bounds.obs_dim
-        self._indices = np.zeros((3, n_envs, k), np.int64)
-        self._probabilities = np.zeros((3, n_envs, k))
-        n_blocks = len(rule.blocks) - 1
-        self._entries = np.zeros((3, n_envs, k, n_blocks), np.int64)
-        self.shape = n_envs, k, n_blocks
-        self._held = np.full((n_envs, n_blocks), kernel.UNDRAWN)
-        self._lengths = np.zeros(1 + n_envs)
-        actions = np.zeros((3, n_envs, self._rule[-1].shape[1]))
-        self._truncated = np.zeros(n_envs, np.bool_)
-        self._last_observations = np.zeros((n_envs, obs_dim))
-        self._episodes = (
-            self._indices,
-            self._probabilities,
-            self._entries,
-            actions,
-            self._truncated,
-            self._last_observations,
-            self._held,
-            self._lengths,
-        )
-        self._sums = np.zeros(3)
-        self._places = np.zeros((n_envs, k), np.int64)
-        self._work = self._sums, np.zeros((2, table.n_actions)), np.zeros(n_envs), self._places
-        self._set_desk()
+        table.start_traces(n_envs)
+        self._workplace = Workplace(perceiver, table, selector.kernel_arguments(), n_envs, config, stream=stream)
+        self._prepare()
 
-    def _set_desk(self) -> None:
-        """Take up perception and memory as they are now."""
-        self._eyes = self.perceiver.eyes
-        memory, chance = self.live.memory(), (self.stream.rows, self.stream.taken)
-        # A desk does not keep its arrays. All others are in attributes of their own.
-        self._lent = memory, chance
-        self._desk = set_desk(self._eyes, self._rule, self._form, self._episodes, memory, chance, self._work)
-        self._learn = kernel.learn_on(self._desk)
-        # One action for all neighbours is the column that the first answers for.
-        averages, actions = self._rule[0] == kernel.AVERAGE, self._episodes[3]
-        self._actions: np.ndarray = self._entries[kernel.NOW, :, 0, 0] if averages else actions[kernel.NOW]
+    def _prepare(self) -> None:
+        self._learn = td.learn_with(self._workplace.state)
+        self._versions = self._workplace.versions
+
+    def _bind(self) -> None:
+        self._workplace.bind()
+        self._prepare()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in OF_THE_DESK}
+        return {name: value for name, value in self.__dict__.items() if name != "_learn"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._set_desk()
+        self._prepare()
 
-    def _make_room(self) -> None:
-        most_new_points = self._places.size
-        changed = self.table.reserve(most_new_points)
-        if self.live.reserve(most_new_points) or changed:
-            self._set_desk()
+    @property
+    def actions(self) -> np.ndarray:
+        episodes = self._workplace.episodes
+        # One action for all neighbours is the column that the first of them selected.
+        if self._workplace.selection.combination == Combination.OF_VALUES:
+            return episodes.action_indices[td.CURRENT, :, 0, 0]
+        return episodes.actions[td.CURRENT]
 
-    def begin(self, observations: np.ndarray, rate: float) -> np.ndarray:
+    def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
+        super().configure(selector, config)
+        with self.table.lock:
+            self._workplace.selection = selector.kernel_arguments()
+            self._workplace.config = config
+            self._bind()
+
+    def begin(self, observations: np.ndarray, exploration_rate: float) -> None:
         check_finite("an observation", observations, range(self.n_envs))
-        self.live.clear()
-        self._set_desk()
         seen = as_rows(observations)
-        if self.perceiver.search_is_outside:
-            self._find(seen, kernel.NOW)
-        kernel.begin(self._desk, seen, self.stream.next()[:, 0], rate)
+        with self.table.lock:
+            self.table.drop_traces()
+            self._bind()
+            if self.perceiver.search_is_outside:
+                self._find(seen, td.CURRENT)
+            td.begin(self._workplace.state, seen, self.stream.next()[:, 0], exploration_rate)
+        self._workplace.work.trace_bound[0] = 0.0
         self.in_episodes = True
-        return self._actions
 
-    def learn(
+    def step(
         self,
         observations: np.ndarray,
         rewards: np.ndarray,
         ended: np.ndarray,
         truncated: Mapping[int, np.ndarray],
         rates: Rates,
-    ) -> np.ndarray:
-        if self.perceiver.eyes is not self._eyes:
-            self._set_desk()
-        self.live.is_published = False
+    ) -> None:
         seen = observations if observations.dtype is FLOAT32 and observations.ndim == 2 else as_rows(observations)
-        if self.perceiver.search_is_outside:
-            check_transition(observations, rewards)
-            self._find(seen, kernel.THEN)
-        if truncated:
-            self._take_in(truncated)
+        with self.table.lock:
+            if self._versions != (self.perceiver.version, self.table.version):
+                self._bind()
+            if self.perceiver.search_is_outside:
+                check_transition(observations, rewards)
+                self._find(seen, td.NEXT)
+            if not truncated:
+                self._step(seen, observations, rewards, ended, rates)
+                return
+            try:
+                self._take_in(truncated)
+                self._step(seen, observations, rewards, ended, rates)
+            finally:
+                self._workplace.episodes.truncated[:] = False
+
+    def _step(
+        self, seen: np.ndarray, observations: np.ndarray, rewards: np.ndarray, ended: np.ndarray, rates: Rates
+    ) -> None:
         # One by one, which numba takes in a quarter of a microsecond sooner than their tuple.
-        alpha, trace_decay, rate = rates
-        answer = self._learn(seen, rewards, ended, alpha, trace_decay, rate)
-        while answer != FINE:
-            if answer == USED_UP:
+        learning_rate, trace_decay, exploration = rates
+        outcome = self._learn(seen, rewards, ended, learning_rate, trace_decay, exploration)
+        while outcome != td.OK:
+            if outcome == td.NEED_RANDOM:
                 self.stream.refill()
-            elif answer == FULL:
-                self._make_room()
+            elif outcome == td.NEED_CAPACITY:
+                self.table.reserve(self._workplace.work.places.size)
+                self._bind()
             else:
-                self._truncated[:] = False
+                rates.check(self.selector)
                 check_transition(observations, rewards)
                 raise FloatingPointError(DIVERGENCE)
-            answer = self._learn(seen, rewards, ended, alpha, trace_decay, rate)
-        if truncated:
-            self._truncated[:] = False
-        return self._actions
+            outcome = self._learn(seen, rewards, ended, learning_rate, trace_decay, exploration)
+
+    def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
+        rates = update_rates(learning_rate, trace_decay)
+        columns = transitions.columns(self.selector, self.perceiver.bounds.obs_dim)
+        n, k = len(columns), self.shape[1]
+        before, after = (
+            as_rows(np.asarray(array)).reshape(n, -1).astype(np.float64)
+            for array in (transitions.observations, transitions.next_observations)
+        )
+        found, distances = np.empty((2, 0, k), np.int64), np.empty((2, 0, k))
+        if self.perceiver.search_is_outside:
+            neighbors = [self.perceiver.find(th.from_numpy(rows)) for rows in (before, after)]
+            found = np.stack([each.indices.numpy() for each in neighbors])
+            distances = np.stack([each.squared_distances.numpy() for each in neighbors])
+        rewards = np.asarray(transitions.rewards, dtype=np.float64)
+        terminated, ended = (np.asarray(array, bool) for array in (transitions.terminated, transitions.ended))
+        with self.table.lock:
+            own = ActiveTraces(self.table.n_actions, 1)
+            write_back(self.table.arrays(), self.table.traces.arrays)
+            arguments = self.selector.kernel_arguments()
+            place = Workplace(self.perceiver, self.table, arguments, 1, self.config, traces=own)
+            done, outcome = 0, td.OK
+            try:
+                while done < n:
+                    done, outcome = td.update(
+                        place.state,
+                        before,
+                        columns,
+                        rewards,
+                        after,
+                        terminated,
+                        ended,
+                        found,
+                        distances,
+                        done,
+                        rates.learning_rate,
+                        rates.trace_decay,
+                    )
+                    if outcome == td.NEED_CAPACITY:
+                        self.table.make_room(own, k)
+                        place.bind()
+                    elif outcome != td.OK:
+                        raise FloatingPointError(f"transition {done}: {DIVERGENCE}")
+            finally:
+                write_back(self.table.arrays(), own.arrays)
+                adopt(self.table.arrays(), self.table.traces.arrays)
+                self._workplace.work.value_bound[0] = np.inf
+
+    def _find(self, seen: np.ndarray, which: int, envs: Any = slice(None)) -> None:
+        """Find the neighbours by a search that the kernel does not have in it."""
+        neighbors = self.perceiver.find(th.from_numpy(seen))
+        episodes = self._workplace.episodes
+        episodes.indices[which, envs] = neighbors.indices.numpy()
+        episodes.probabilities[which, envs] = neighbors.squared_distances.numpy()
+
+    def _take_in(self, truncated: Mapping[int, np.ndarray]) -> None:
+        episodes = self._workplace.episodes
+        for env, last_observation in truncated.items():
+            episodes.truncated[env] = True
+            episodes.last_observations[env] = last_observation
+        if self.perceiver.search_is_outside:
+            envs = list(truncated)
+            self._find(episodes.last_observations[envs], td.TERMINAL, envs)
 
     @property
     def n_traced(self) -> int:
-        return self.live.count
+        return self.table.traces.count
 
     def summary(self) -> dict[str, float]:
-        if not self._sums[2]:
+        sums = self._workplace.work.sums
+        if not sums[2]:
             return {}
-        td_error, q_mean = (self._sums[:2] / self._sums[2]).tolist()
-        self._sums[:] = 0.0
+        td_error, q_mean = (sums[:2] / sums[2]).tolist()
+        sums[:] = 0.0
         return {"td_error": td_error, "q_mean": q_mean}
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "indices": th.from_numpy(self._indices[kernel.NOW].copy()),
-            "probabilities": th.from_numpy(self._probabilities[kernel.NOW].copy()),
-            "entries": th.from_numpy(self._entries[kernel.NOW].copy()),
-            "held": th.from_numpy(self._held.copy()),
-            "lengths": th.from_numpy(self._lengths.copy()),
-            "traces": self.live.state(),
-        }
+        episodes = self._workplace.episodes
+        with self.table.lock:
+            return {
+                "indices": th.from_numpy(episodes.indices[td.CURRENT].copy()),
+                "probabilities": th.from_numpy(episodes.probabilities[td.CURRENT].copy()),
+                "entries": th.from_numpy(episodes.action_indices[td.CURRENT].copy()),
+                "held": th.from_numpy(episodes.persistent.copy()),
+                "lengths": th.from_numpy(episodes.lengths.copy()),
+                "traces": self.table.traces.state(),
+            }
 
     def _forget(self) -> None:
-        self.live.forget()
-        self._set_desk()
+        self.table.forget_traces()
+        self._bind()
 
     def _take_over(self, state_dict: dict[str, Any]) -> None:
-        self._indices[kernel.NOW] = state_dict["indices"].numpy()
-        self._probabilities[kernel.NOW] = state_dict["probabilities"].numpy()
-        self._entries[kernel.NOW] = state_dict["entries"].numpy()
-        self._held[:] = state_dict["held"].numpy()
-        self._lengths[:] = state_dict["lengths"].numpy()
-        self.live.set_state(state_dict["traces"])
-        self._set_desk()
+        episodes = self._workplace.episodes
+        episodes.indices[td.CURRENT] = state_dict["indices"].numpy()
+        episodes.probabilities[td.CURRENT] = state_dict["probabilities"].numpy()
+        episodes.action_indices[td.CURRENT] = state_dict["entries"].numpy()
+        episodes.persistent[:] = state_dict["held"].numpy()
+        episodes.lengths[:] = state_dict["lengths"].numpy()
+        # Added up in the order of the kernel, to the last bit.
+        actions = episodes.actions[td.CURRENT]
+        actions[:] = 0.0
+        for (env, neighbor, _), column in np.ndenumerate(episodes.action_indices[td.CURRENT]):
+            weight = episodes.probabilities[td.CURRENT, env, neighbor]
+            actions[env] += weight * self._workplace.selection.action_points[column]
+        self.table.traces.set_state(state_dict["traces"])
+        self._bind()
 
-    def _take_in(self, truncated: Mapping[int, np.ndarray]) -> None:
-        for env, last_observation in truncated.items():
-            self._truncated[env] = True
-            self._last_observations[env] = last_observation
-        if self.perceiver.search_is_outside:
-            envs = list(truncated)
-            self._find(self._last_observations[envs], kernel.LAST, envs)
 
-    def _find(self, observations: np.ndarray, state: int, rows: Any = slice(None)) -> None:
-        """Have the neighbours found by a search that the kernel does not have in it."""
-        neighbors = self.perceiver.find(th.from_numpy(observations))
-        self._indices[state, rows] = neighbors.indices.numpy()
-        self._probabilities[state, rows] = neighbors.squared_distances.numpy()
+class GreedyReader:
+    """
+    Reads the greedy actions of single observations from a table, from any thread and while a learner works.
+
+    :param perceiver: with weights that are known to the kernels
+    :param table: the Q-table, on the CPU
+    :param selector: selects actions
+    """
+
+    def __init__(self, perceiver: Perceiver, table: QTable, selector: ActionSelector) -> None:
+        config = UpdateConfig(gamma=1.0, normalized=True, accumulating=False, reset_other_actions=False)
+        self._workplace = Workplace(perceiver, table, selector.kernel_arguments(greedy=True), 1, config)
+        self._workplace.episodes.persistent[:] = GREEDY
+        self._uniforms = np.zeros(selector.n_uniforms)
+
+    def __call__(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param observations: shape (batch, obs_dim), finite, observation units
+        :return: the columns that the neighbours select, shape (batch, k, n_factors), and how much each neighbour
+            counts, shape (batch, k)
+        """
+        place = self._workplace
+        perceiver, n = place.perceiver, len(observations)
+        _, _, k, n_factors = place.episodes.action_indices.shape
+        seen = observations.astype(np.float64)
+        with place.table.lock:
+            place.follow()
+            if perceiver.search_is_outside:
+                neighbors = perceiver.find(th.from_numpy(seen))
+                indices, probabilities = neighbors.indices.numpy(), neighbors.squared_distances.numpy()
+            else:
+                indices, probabilities = np.empty((n, k), np.int64), np.empty((n, k))
+            selected = np.empty((n, k, n_factors), np.int64)
+            td.recommend(place.state, seen, self._uniforms, indices, probabilities, selected)
+        return selected, probabilities
 
 
 def as_rows(observations: np.ndarray) -> np.ndarray:

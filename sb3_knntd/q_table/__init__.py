@@ -1,9 +1,9 @@
-"""What is it worth? The Q-table and its eligibility traces."""
+"""The Q-table and its eligibility traces."""
 
 from __future__ import annotations
 
-from sb3_knntd.q_table.active_traces import LiveStore
+from sb3_knntd.q_table.active_traces import ActiveTraces
 from sb3_knntd.q_table.table import DenseTable, HashedTable, QTable
 from sb3_knntd.q_table.traces import DenseTraces, OneStepTraces, Traces
 
-__all__ = ["DenseTable", "DenseTraces", "HashedTable", "LiveStore", "OneStepTraces", "QTable", "Traces"]
+__all__ = ["ActiveTraces", "DenseTable", "DenseTraces", "HashedTable", "OneStepTraces", "QTable", "Traces"]

@@ -1,4 +1,4 @@
-"""The entries that have a trace, and what each of them is owed."""
+"""The eligibility traces of the compiled learner, and the values of the entries that have one."""
 
 from __future__ import annotations
 
@@ -7,110 +7,108 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_knntd.kernels.memory import publish, rehash, settle
-from sb3_knntd.q_table.table import QTable, make_slots
+from sb3_knntd.kernels.traces import TableArrays, TraceArrays, flush, rehash
+
+#: Active points that there is room for at the start.
+SMALLEST_CAPACITY = 1024
 
 
-class LiveStore:
+class ActiveTraces:
     """
-    Exact eligibility traces at a cost that depends on neither the table, nor λ, nor the episode's length;
-    :mod:`sb3_knntd.kernels.memory` says how. While a point is live its values are kept here, and the table is
-    lent them when somebody reads it.
+    Exact eligibility traces at a cost that depends on neither the table, nor λ, nor the length of the episode.
+    :mod:`sb3_knntd.kernels.traces` says how. While a point is active its values are kept here.
 
-    :param table: the table that the traces are for, on the CPU
+    :param n_actions: number of columns of the table
     :param n_envs: number of environments
+    :param capacity: number of points that there is room for
     """
 
-    SMALLEST = 1024
+    #: replaced as a whole, so that an interruption leaves all arrays as they were
+    arrays: TraceArrays
 
-    def __init__(self, table: QTable, n_envs: int) -> None:
-        self.table = table
+    def __init__(self, n_actions: int, n_envs: int, capacity: int = SMALLEST_CAPACITY) -> None:
+        self.n_actions = n_actions
         self.n_envs = n_envs
-        #: whether the table has the values of the live points
-        self.is_published = True
-        self._allocate(self.SMALLEST)
-        table.lender = self
+        self.arrays = self._empty(capacity)
 
-    def _allocate(self, capacity: int) -> None:
-        self.points = np.empty(capacity, np.int64)
-        self.entries = np.empty((capacity, self.table.n_actions, self.n_envs + 2))
-        self.slots = make_slots(capacity)
-        self.table.counts[1] = 0
-        self.pace = np.zeros(1 + self.n_envs)
-        self.pace[0] = 1.0
+    def _empty(self, capacity: int) -> TraceArrays:
+        clock = np.zeros(1 + self.n_envs)
+        clock[0] = 1.0
+        return TraceArrays(
+            active_points=np.empty(capacity, np.int64),
+            active_entries=np.empty((capacity, self.n_actions, self.n_envs + 2)),
+            active_slots=make_slots(capacity),
+            n_active=np.zeros(1, np.int64),
+            clock=clock,
+        )
 
     @property
     def count(self) -> int:
-        """Number of live points."""
-        return int(self.table.counts[1])
+        """Number of active points."""
+        return int(self.arrays.n_active[0])
 
-    def memory(self) -> tuple[Any, ...]:
-        """
-        :return: ``memory`` of :func:`sb3_knntd.kernels.step.learn`
-        """
-        return (*self.table.arrays(), self.points, self.entries, self.slots, self.table.counts, self.pace)
+    @property
+    def capacity(self) -> int:
+        """Number of points that there is room for."""
+        return len(self.arrays.active_points)
 
-    def reserve(self, n_points: int) -> bool:
+    def reserve(self, n_points: int, table: TableArrays) -> bool:
         """
-        Make room.
+        Make room, first by dropping the points whose traces have decayed.
 
-        :param n_points: how many points may come to life in the next step
+        :param n_points: how many points may become active in the next step
+        :param table: where the values of dropped points are written
         :return: whether the arrays have been replaced
         """
-        if len(self.points) - self.count >= n_points:
+        if self.capacity - self.count >= n_points:
             return False
-        values, _, _, row_slots, _, points, entries, slots, counts, pace = self.memory()
-        settle(values, row_slots, points, entries, slots, counts, pace)
+        flush(table, self.arrays)
         wanted = 2 * self.count + n_points
-        if wanted <= len(self.points):
+        if wanted <= self.capacity:
             return False
-        self.set_state({**self.state(), "capacity": max(2 * len(self.points), wanted)})
-        self.is_published = False
+        self.arrays = self._made_of(self.state(), max(2 * self.capacity, wanted))
         return True
 
-    def publish(self) -> None:
-        """Write the values of the live points into the table."""
-        if not self.is_published:
-            values, _, _, row_slots, _, points, entries, _, counts, pace = self.memory()
-            publish(values, row_slots, points, entries, counts, pace)
-            self.is_published = True
-
-    def forget(self) -> None:
-        """Let go all traces, and what they have gained since the table was last written."""
-        self._allocate(self.SMALLEST)
-        self.is_published = True
-
     def clear(self) -> None:
-        """Let go all traces."""
-        self.publish()
-        self.forget()
+        """Drop all traces, and the values of the entries that had one."""
+        self.arrays = self._empty(SMALLEST_CAPACITY)
 
     def state(self) -> dict[str, Any]:
         """
         :return: tensors and numbers from which :meth:`set_state` goes on to the same bit
         """
-        n, n_envs = self.count, self.n_envs
-        entries = th.from_numpy(self.entries[:n].copy())
+        n, n_envs, arrays = self.count, self.n_envs, self.arrays
+        entries = th.from_numpy(arrays.active_entries[:n].copy())
         return {
-            "points": th.from_numpy(self.points[:n].copy()),
+            "points": th.from_numpy(arrays.active_points[:n].copy()),
             "traces": entries[..., :n_envs].contiguous(),
             "share": entries[..., n_envs].contiguous(),
             "base": entries[..., n_envs + 1].contiguous(),
-            "pace": th.from_numpy(self.pace.copy()),
-            "capacity": len(self.points),
+            "pace": th.from_numpy(arrays.clock.copy()),
+            "capacity": self.capacity,
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """
         :param state: what :meth:`state` returned, for as many environments
         """
-        self._allocate(state["capacity"])
-        n, n_envs = len(state["points"]), self.n_envs
-        self.points[:n] = state["points"].numpy()
-        self.entries[:n, :, :n_envs] = state["traces"].numpy()
-        self.entries[:n, :, n_envs] = state["share"].numpy()
-        self.entries[:n, :, n_envs + 1] = state["base"].numpy()
-        self.pace[:] = state["pace"].numpy()
-        self.table.counts[1] = n
-        rehash(self.points, n, self.slots)
-        self.is_published = True
+        self.arrays = self._made_of(state, state["capacity"])
+
+    def _made_of(self, state: dict[str, Any], capacity: int) -> TraceArrays:
+        arrays, n, n_envs = self._empty(capacity), len(state["points"]), self.n_envs
+        arrays.active_points[:n] = state["points"].numpy()
+        arrays.active_entries[:n, :, :n_envs] = state["traces"].numpy()
+        arrays.active_entries[:n, :, n_envs] = state["share"].numpy()
+        arrays.active_entries[:n, :, n_envs + 1] = state["base"].numpy()
+        arrays.clock[:] = state["pace"].numpy()
+        arrays.n_active[0] = n
+        rehash(arrays.active_points, n, arrays.active_slots)
+        return arrays
+
+
+def make_slots(capacity: int) -> np.ndarray:
+    """
+    :param capacity: how many points a hash is to hold
+    :return: an empty hash, at most half full then, see :mod:`sb3_knntd.kernels.traces`
+    """
+    return np.full((1 << max(2 * capacity - 1, 1).bit_length(), 2), -1, np.int64)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch as th
@@ -11,37 +12,30 @@ from torch import nn
 
 from sb3_knntd.common.state_checks import checked_points, checked_tensor
 from sb3_knntd.common.tracing import is_traced
-from sb3_knntd.kernels.memory import find_rows, rehash
+from sb3_knntd.kernels.traces import TableArrays, read_rows, rehash, write_back
+from sb3_knntd.q_table.active_traces import ActiveTraces, make_slots
 
-
-class Lender(Protocol):
-    """Holds newer values of some rows than the table does."""
-
-    def publish(self) -> None:
-        """Write them into the table."""
-
-    def forget(self) -> None:
-        """Drop them: the table has been given other values."""
+#: Points whose values are carried over at a time.
+BATCH = 2**16
 
 
 class Regridding(Protocol):
     """From the points where they were to where they are, see :class:`~sb3_knntd.perception.perceiver.Regridding`."""
 
     def sources(self, indices: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Of points as they are, the points they were nearest to, and how much each of these counts."""
+        """The points that points as they are were nearest to, and how much each of these counts."""
 
     def targets(self, indices: th.Tensor) -> th.Tensor:
-        """Of points as they were, the point that is now nearest to each."""
-
-
-#: Points whose values are carried over in one go.
-BATCH = 2**16
+        """The point that is now nearest to each point as it was."""
 
 
 class QTable(nn.Module, ABC):
     """
-    What every table does. A learner may keep newer values of some rows; it gives itself as ``lender``, and
-    whatever reads the table here asks it for them first.
+    What every table does.
+
+    Its entries can be read from any thread at any time, also while a learner works: both hold :attr:`lock`. Values of
+    the points that have an eligibility trace are kept in :attr:`traces` until the trace has decayed, and everything that
+    reads the table here takes them from there.
 
     :param n_actions: number of columns
     :param initial_value: what every entry is at the start
@@ -53,34 +47,65 @@ class QTable(nn.Module, ABC):
         super().__init__()
         self.n_actions = n_actions
         self.initial_value = float(initial_value)
-        self.lender: Lender | None = None
-        #: number of rows made, number of live points: see :mod:`sb3_knntd.kernels.memory`
-        self.counts = np.zeros(2, np.int64)
+        #: to be held while entries are read or written
+        self.lock = threading.RLock()
+        #: raised whenever arrays have been replaced, or other values given to them
+        self.version = 0
+        self.traces = ActiveTraces(n_actions, n_envs=1, capacity=0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A lock belongs to one table in one process.
+        return {name: value for name, value in self.__dict__.items() if name != "lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self.lock = threading.RLock()
 
     @property
     @abstractmethod
     def n_visited(self) -> int:
         """Number of points that have been learned at."""
 
-    def sync(self) -> None:
-        """Bring the table up to date with its learner."""
-        if self.lender is not None:
-            self.lender.publish()
+    def start_traces(self, n_envs: int) -> ActiveTraces:
+        """
+        Drop all traces, and begin to keep those of so many environments.
 
-    def _forget_lent(self) -> None:
-        if self.lender is not None:
-            self.lender.forget()
+        :param n_envs: number of environments
+        :return: the traces, which this table reads from then on
+        """
+        with self.lock:
+            self._write_back()
+            self.traces = ActiveTraces(self.n_actions, n_envs)
+            self.version += 1
+            return self.traces
+
+    def drop_traces(self) -> None:
+        """Drop all traces; the entries keep the values that they have."""
+        with self.lock:
+            self._write_back()
+            self.forget_traces()
 
     def train(self, mode: bool = True) -> QTable:
         """
-        As in torch. It brings the table up to date besides: to be exported with its values, a policy is put in
+        As in torch. It brings :attr:`values` up to date besides: to be exported with its values, a policy is put in
         evaluation mode first.
 
         :param mode: whether to train
         :return: the table
         """
-        self.sync()
+        self._write_back()
         return super().train(mode)
+
+    def _write_back(self) -> None:
+        """Bring ``values`` up to date. A learner does not look at what this writes before it writes there itself."""
+        if self.traces.count:
+            with self.lock:
+                write_back(self.arrays(), self.traces.arrays)
+
+    def forget_traces(self) -> None:
+        """Drop all traces and the values of the entries that had one."""
+        self.traces.clear()
+        self.version += 1
 
     @abstractmethod
     def entries(self) -> th.Tensor:
@@ -94,33 +119,56 @@ class QTable(nn.Module, ABC):
         :return: the point of each row, shape (n_rows,), int64; ``None`` if the points are the rows
         """
 
-    @abstractmethod
     def rows(self, indices: th.Tensor) -> th.Tensor:
         """
         :param indices: points, shape (batch, k), int64
         :return: their values, up to date, shape (batch, k, n_actions)
         """
+        rows = np.empty((indices.numel(), self.n_actions), self.values.numpy().dtype)
+        with self.lock:
+            read_rows(indices.reshape(-1).numpy(), self.arrays(), self.traces.arrays, rows)
+        return th.from_numpy(rows).reshape(*indices.shape, self.n_actions)
 
-    @abstractmethod
-    def reserve(self, n_points: int) -> bool:
+    def reserve(self, n_points: int) -> None:
         """
         Make room.
 
-        :param n_points: how many new points there may be in the next step
-        :return: whether the arrays have been replaced
+        :param n_points: how many points the next step may come upon
+        """
+        self.make_room(self.traces, n_points)
+
+    def make_room(self, traces: ActiveTraces, n_points: int) -> None:
+        """
+        Make room in the table and in traces of it.
+
+        :param traces: this table's, or others
+        :param n_points: how many points the next step may come upon
+        """
+        if self._reserve_rows(n_points) | traces.reserve(n_points, self.arrays()):
+            self.version += 1
+
+    @abstractmethod
+    def _reserve_rows(self, n_points: int) -> bool:
+        """Make room for the rows of so many points; whether arrays have been replaced."""
+
+    @abstractmethod
+    def add_rows(self, values: th.Tensor) -> None:
+        """
+        Take in new points, numbered from the last one on.
+
+        :param values: their values, shape (n_new, n_actions)
         """
 
     @abstractmethod
-    def arrays(self) -> tuple[Any, ...]:
+    def arrays(self) -> TableArrays:
         """
-        :return: values, visited, row_points, row_slots and initial of :mod:`sb3_knntd.kernels.memory`, sharing
-            memory with this table
+        :return: what the kernels work on, sharing memory with this table
         """
 
     @abstractmethod
     def carry_over(self, regridding: Regridding) -> None:
         """
-        Give each point the values that the table had where the point now is. A learner's traces are let go.
+        Give each point the values that the table had where the point now is. All traces are dropped.
 
         :param regridding: where the points were, and where they are
         """
@@ -130,9 +178,11 @@ class QTable(nn.Module, ABC):
         """The mean of the rows at ``sources``, rows of shape (n, k, n_actions), shape (n, n_actions)."""
         return (sources[1][..., None].to(values.dtype) * values).sum(dim=1)
 
-    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        self.sync()
-        super()._save_to_state_dict(destination, prefix, keep_vars)
+    def _apply(self, fn: Any, recurse: bool = True) -> QTable:
+        self.drop_traces()
+        super()._apply(fn, recurse)
+        self.version += 1
+        return self
 
 
 class DenseTable(QTable):
@@ -150,8 +200,12 @@ class DenseTable(QTable):
     def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
         self.register_buffer("values", th.full((n_points, n_actions), self.initial_value, dtype=dtype))
-        # Which rows have been learned at, a bit each, and one byte more than there are rows for.
-        self.register_buffer("visited", th.zeros((n_points + 7) // 8 + 1, dtype=th.uint8))
+        self.register_buffer("visited", self._no_visits(n_points))
+
+    @staticmethod
+    def _no_visits(n_points: int) -> th.Tensor:
+        """Which rows have been learned at, a bit each, and one byte more than there are rows for."""
+        return th.zeros((n_points + 7) // 8 + 1, dtype=th.uint8)
 
     @property
     def n_visited(self) -> int:
@@ -163,56 +217,103 @@ class DenseTable(QTable):
 
         :param indices: points, any shape, int64
         """
+        self._visit(self.visited, indices)
+
+    @staticmethod
+    def _visit(visited: th.Tensor, indices: th.Tensor) -> None:
         byte, bit = indices.reshape(-1) >> 3, indices.reshape(-1) & 7
         for each in range(8):
             # All that write to a byte at once write the same; points of another bit write to the byte to spare.
-            at = th.where(bit == each, byte, len(self.visited) - 1)
-            self.visited[at] = self.visited[at] | (1 << each)
+            at = th.where(bit == each, byte, len(visited) - 1)
+            visited[at] = visited[at] | (1 << each)
 
     def entries(self) -> th.Tensor:
-        self.sync()
+        self._write_back()
         return self.values
 
     def points(self) -> None:
         return None
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
-        self.sync()
-        return self.values[indices]
+        if is_traced() or not self.traces.count:
+            with self.lock:
+                return self.values[indices]
+        return super().rows(indices)
 
-    def reserve(self, n_points: int) -> bool:
+    def _reserve_rows(self, n_points: int) -> bool:
         return False
 
+    def add_rows(self, values: th.Tensor) -> None:
+        with self.lock:
+            self.drop_traces()
+            n_points = len(self.values) + len(values)
+            grown = th.cat((self.values, values.to(self.values)))
+            visited = self._no_visits(n_points).to(self.values.device)
+            visited[: len(self.visited) - 1] = self.visited[:-1]
+            self.values, self.visited = grown, visited
+            self.version += 1
+
     def carry_over(self, regridding: Regridding) -> None:
-        old, was_visited = self.entries().clone(), self._visits()
-        self._forget_lent()
-        self.visited.zero_()
-        for points in th.arange(len(old), device=old.device).split(BATCH):
-            sources = regridding.sources(points)
-            self.values[points] = self._carried(old[sources[0]], sources)
-            self.visit(points[was_visited[sources[0][:, 0]]])
+        with self.lock:
+            old, was_visited = self.entries(), self._visits()
+            values, visited = th.empty_like(old), th.zeros_like(self.visited)
+            for points in th.arange(len(old), device=old.device).split(BATCH):
+                sources = regridding.sources(points)
+                values[points] = self._carried(old[sources[0]], sources)
+                self._visit(visited, points[was_visited[sources[0][:, 0]]])
+            self.forget_traces()
+            self.values.copy_(values)
+            self.visited.copy_(visited)
 
     def _visits(self) -> th.Tensor:
         """Which rows have been learned at, shape (n_points,), bool."""
         bits = th.arange(8, device=self.visited.device, dtype=th.uint8)
         return ((self.visited[:-1, None] >> bits) & 1).bool().flatten()[: len(self.values)]
 
-    def arrays(self) -> tuple[Any, ...]:
-        no_points, no_slots = np.empty(0, np.int64), np.empty((0, 2), np.int64)
-        return self.values.numpy(), self.visited.numpy(), no_points, no_slots, self.initial_value
+    def arrays(self) -> TableArrays:
+        return TableArrays(
+            values=self.values.numpy(),
+            visited=self.visited.numpy(),
+            row_points=np.empty(0, np.int64),
+            row_slots=np.empty((0, 2), np.int64),
+            n_rows=np.zeros(1, np.int64),
+            initial_value=self.initial_value,
+        )
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        with self.lock:
+            self._write_back()
+            super()._save_to_state_dict(destination, prefix, keep_vars)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        # What is missing or has another shape torch tells of.
-        if prefix + "values" in state_dict:
-            checked_tensor(state_dict, prefix + "values", (None, None))
-        self._forget_lent()
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        with self.lock:
+            # What is missing or has another shape torch tells of.
+            if prefix + "values" in state_dict:
+                checked_tensor(state_dict, prefix + "values", (None, None))
+            self.forget_traces()
+            super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+class _Rows(NamedTuple):
+    """
+    The rows of a hashed table.
+
+    :param values: shape (capacity, n_actions)
+    :param points: the point of each row, shape (capacity,), int64
+    :param slots: hash of the rows by point
+    :param count: number of rows in use, shape (1,), int64
+    """
+
+    values: th.Tensor
+    points: th.Tensor
+    slots: np.ndarray
+    count: np.ndarray
 
 
 class HashedTable(QTable):
     """
-    A row for every point that has been learned at, made then; all others are worth the initial value. For
-    lattices larger than memory. On the CPU only.
+    A row for every point that has been learned at; all others are worth the initial value. For lattices larger than
+    memory. On the CPU only.
 
     :param n_points: number of points that may get a row
     :param n_actions: number of columns
@@ -222,25 +323,43 @@ class HashedTable(QTable):
 
     SMALLEST = 1024
 
-    row_points: th.Tensor
-
     def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
         self.n_points = n_points
-        self.register_buffer("values", th.empty((0, n_actions), dtype=dtype))
-        self.register_buffer("row_points", th.empty(0, dtype=th.int64))
-        self._resize(self.SMALLEST)
+        no_points, no_values = th.empty(0, dtype=th.int64), th.empty((0, n_actions), dtype=dtype)
+        # Replaced as a whole, so that an interruption leaves all rows as they were.
+        self._rows = self._made_of(no_points, no_values, self.SMALLEST)
+
+    def _made_of(self, points: th.Tensor, values: th.Tensor, capacity: int) -> _Rows:
+        """These rows, and room for more."""
+        n = len(points)
+        rows = _Rows(
+            th.full((capacity, self.n_actions), self.initial_value, dtype=values.dtype),
+            th.full((capacity,), -1, dtype=th.int64),
+            make_slots(capacity),
+            np.array([n]),
+        )
+        rows.values[:n] = values
+        rows.points[:n] = points
+        rehash(rows.points.numpy(), n, rows.slots)
+        return rows
+
+    @property
+    def values(self) -> th.Tensor:  # type: ignore[override]
+        """The rows, and those that there is room for, shape (capacity, n_actions)."""
+        return self._rows.values
 
     @property
     def n_visited(self) -> int:
-        return int(self.counts[0])
+        return int(self._rows.count[0])
 
     def entries(self) -> th.Tensor:
-        self.sync()
-        return self.values[: self.n_visited]
+        with self.lock:
+            self._write_back()
+            return self.values[: self.n_visited]
 
     def points(self) -> th.Tensor:
-        return self.row_points[: self.n_visited]
+        return self._rows.points[: self.n_visited]
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
         if is_traced():
@@ -249,64 +368,57 @@ class HashedTable(QTable):
                 "the model with policy_kwargs={'table': 'dense'}, and fewer points if it would not fit; predict works "
                 "with any"
             )
-        self.sync()
-        found = np.empty(indices.numel(), np.int64)
-        find_rows(indices.reshape(-1).numpy(), self._slots, found)
-        rows = th.from_numpy(found).reshape(indices.shape)
-        return th.where((rows >= 0)[..., None], self.values[rows.clamp(min=0)], self.initial_value)
+        return super().rows(indices)
 
-    def reserve(self, n_points: int) -> bool:
-        if len(self.values) - self.n_visited >= n_points:
+    def _reserve_rows(self, n_points: int) -> bool:
+        rows, n = self._rows, self.n_visited
+        if len(rows.values) - n >= n_points:
             return False
-        self._resize(max(2 * len(self.values), self.n_visited + n_points))
+        capacity = max(2 * len(rows.values), n + n_points)
+        self._rows = self._made_of(rows.points[:n], rows.values[:n], capacity)
         return True
 
+    def add_rows(self, values: th.Tensor) -> None:
+        raise ValueError("points can be added to a dense table only: policy_kwargs={'table': 'dense'}")
+
     def carry_over(self, regridding: Regridding) -> None:
-        self.sync()
-        points = th.cat([regridding.targets(part) for part in self.points().split(BATCH)]).unique()
-        values = th.cat([self._carried(self.rows(s[0]), s) for s in map(regridding.sources, points.split(BATCH))])
-        self._refill(points, values)
+        with self.lock:
+            points = th.cat([regridding.targets(part) for part in self.points().split(BATCH)]).unique()
+            values = th.cat([self._carried(self.rows(s[0]), s) for s in map(regridding.sources, points.split(BATCH))])
+            self._refill(points, values)
 
-    def arrays(self) -> tuple[Any, ...]:
-        no_bits = np.empty(0, np.uint8)
-        return self.values.numpy(), no_bits, self.row_points.numpy(), self._slots, self.initial_value
-
-    def _resize(self, capacity: int) -> None:
-        for name, fill in (("values", self.initial_value), ("row_points", -1)):
-            old = getattr(self, name)
-            new = th.full((capacity, *old.shape[1:]), fill, dtype=old.dtype)
-            new[: len(old)] = old[:capacity]
-            setattr(self, name, new)
-        self._slots = make_slots(capacity)
-        rehash(self.row_points.numpy(), self.n_visited, self._slots)
+    def arrays(self) -> TableArrays:
+        rows = self._rows
+        return TableArrays(
+            values=rows.values.numpy(),
+            visited=np.empty(0, np.uint8),
+            row_points=rows.points.numpy(),
+            row_slots=rows.slots,
+            n_rows=rows.count,
+            initial_value=self.initial_value,
+        )
 
     def _refill(self, points: th.Tensor, values: th.Tensor) -> None:
         """Have these rows and no others."""
-        self._forget_lent()
-        # Nothing of the rows there were may show through those to be made.
-        self.values, self.row_points = self.values[:0], self.row_points[:0]
-        self.counts[0] = 0
-        self._resize(max(self.SMALLEST, len(points)))
-        self.values[: len(points)] = values
-        self.row_points[: len(points)] = points
-        self.counts[0] = len(points)
-        rehash(self.row_points.numpy(), len(points), self._slots)
+        rows = self._made_of(points, values, max(self.SMALLEST, len(points)))
+        self.forget_traces()
+        self._rows = rows
+
+    def _apply(self, fn: Any, recurse: bool = True) -> HashedTable:
+        super()._apply(fn, recurse)
+        values = fn(self.values)
+        if not values.is_cpu:
+            raise ValueError("a hashed table is on the CPU only: give policy_kwargs={'table': 'dense'}")
+        self._rows = self._rows._replace(values=values)
+        return self
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        super()._save_to_state_dict(destination, prefix, keep_vars)
-        for name in ("values", "row_points"):
-            destination[prefix + name] = destination[prefix + name][: self.n_visited].clone()
+        with self.lock:
+            destination[prefix + "values"] = self.entries().clone()
+            destination[prefix + "row_points"] = self.points().clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        points = checked_points(state_dict, prefix + "row_points", self.n_points)
-        self._refill(points, checked_tensor(state_dict, prefix + "values", (len(points), self.n_actions)))
-        whole = {prefix + name: getattr(self, name).clone() for name in ("values", "row_points")}
-        super()._load_from_state_dict({**state_dict, **whole}, prefix, *args)
-
-
-def make_slots(capacity: int) -> np.ndarray:
-    """
-    :param capacity: how many points a hash is to hold
-    :return: an empty hash, at most half full then, see :mod:`sb3_knntd.kernels.memory`
-    """
-    return np.full((1 << (2 * capacity - 1).bit_length(), 2), -1, np.int64)
+        with self.lock:
+            points = checked_points(state_dict, prefix + "row_points", self.n_points)
+            values = checked_tensor(state_dict, prefix + "values", (len(points), self.n_actions))
+            self._refill(points, values.to(self.values.dtype))

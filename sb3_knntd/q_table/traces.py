@@ -19,13 +19,16 @@ class Traces(ABC):
     environments in the same place do not multiply the step, and one environment alone has eq. 14.
     """
 
+    #: number of points of the table that they are for
+    n_points: int
+
     @abstractmethod
     def mark(self, indices: th.Tensor, entries: th.Tensor, probabilities: th.Tensor) -> None:
         """
         Set the traces of the state each environment is in.
 
         :param indices: points, shape (n_envs, k)
-        :param entries: the columns of each, shape (n_envs, k, n_blocks)
+        :param entries: the columns of each, shape (n_envs, k, n_factors)
         :param probabilities: what to set, shape (n_envs, k), the table's dtype
         """
 
@@ -78,6 +81,7 @@ class DenseTraces(Traces):
         self.table = table
         self.kind = kind
         self.reset_other_actions = reset_other_actions
+        self.n_points = len(table.values)
         self.eligibility = table.values.new_zeros((n_envs, *table.values.shape))
         self._envs = th.arange(n_envs, device=table.values.device)[:, None]
 
@@ -134,6 +138,7 @@ class OneStepTraces(Traces):
 
     def __init__(self, table: DenseTable, n_envs: int) -> None:
         self.n_envs = n_envs
+        self.n_points = len(table.values)
         self._values = table.values.view(-1)
         self._n_actions = table.n_actions
         self._together, self._largest = self._values.new_zeros((2, len(self._values) if n_envs > 1 else 0))

@@ -1,0 +1,127 @@
+"""Checks of what environments return, before anything is learned from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+#: Types of numbers, as NumPy abbreviates them: truth values, integers and floats.
+NUMBERS = "biuf"
+#: Those that truth values may have.
+TRUTHS = "biu"
+
+
+class StepCheck:
+    """
+    Checks the arrays that a step of a VecEnv returns. Compiled code does not look at their sizes.
+
+    :param n_envs: number of environments
+    :param obs_shape: shape of one observation
+    """
+
+    def __init__(self, n_envs: int, obs_shape: tuple[int, ...]) -> None:
+        self._n_envs = n_envs
+        self._obs_shape = obs_shape
+        self._observations_shape = (n_envs, *obs_shape)
+        self._per_env = (n_envs,)
+
+    def reset(self, observations: Any) -> None:
+        """
+        :param observations: what ``reset`` returned
+        :raises ValueError: if it is no array of the right shape
+        """
+        if getattr(observations, "shape", None) != self._observations_shape or observations.dtype.kind not in NUMBERS:
+            self._refuse("reset", "observations", observations, self._observations_shape)
+
+    def step(self, observations: Any, rewards: Any, dones: Any, infos: Any) -> None:
+        """
+        The arguments are what ``step`` returned.
+
+        :raises ValueError: if one of them is no array of the right shape, or there is not an info for each environment
+        """
+        try:
+            fits = (
+                observations.shape == self._observations_shape
+                and rewards.shape == self._per_env
+                and dones.shape == self._per_env
+                and len(infos) == self._n_envs
+                and observations.dtype.kind in NUMBERS
+                and rewards.dtype.kind in NUMBERS
+                and dones.dtype.kind in TRUTHS
+            )
+        except (AttributeError, TypeError):
+            fits = False
+        if not fits:
+            self._refuse("step", "observations", observations, self._observations_shape)
+            self._refuse("step", "rewards", rewards, self._per_env)
+            self._refuse("step", "dones", dones, self._per_env, TRUTHS)
+            count = len(infos) if hasattr(infos, "__len__") else type(infos).__name__
+            raise ValueError(f"the VecEnv's step must return {self._n_envs} infos; got {count}")
+
+    def last_observation(self, env: int, observation: np.ndarray) -> None:
+        """
+        :param env: which environment
+        :param observation: its ``terminal_observation``
+        :raises ValueError: if it has another shape than observations have, or is not finite
+        """
+        if observation.shape != self._obs_shape or observation.dtype.kind not in NUMBERS:
+            raise ValueError(
+                f"environment {env} returned a terminal observation of shape {observation.shape} and type "
+                f"{observation.dtype}; expected numbers of shape {self._obs_shape}"
+            )
+        # Faster than NumPy with few numbers. NumPy then finds out where.
+        if not all(map(isfinite, observation.ravel().tolist())):
+            check_finite("a terminal observation", observation[None], [env])
+
+    @staticmethod
+    def _refuse(call: str, what: str, array: Any, shape: tuple[int, ...], kinds: str = NUMBERS) -> None:
+        """Raise an error that says how an array differs from what is expected, if it does."""
+        wanted = "truth values" if kinds == TRUTHS else "numbers"
+        if not isinstance(array, np.ndarray):
+            got = f"got {type(array).__name__}"
+        elif array.shape != shape:
+            got = f"got shape {array.shape}{_first_odd_row(array, shape)}"
+        elif array.dtype.kind not in kinds:
+            got = f"got type {array.dtype}"
+        else:
+            return
+        raise ValueError(
+            f"the VecEnv's {call} must return {what} as an array of {wanted} of shape {shape}, a row for each of its "
+            f"{shape[0]} environments; {got}"
+        )
+
+
+def _first_odd_row(array: np.ndarray, shape: tuple[int, ...]) -> str:
+    """Which environment has no row, or is the first that has one too many."""
+    if array.ndim and array.shape[0] < shape[0]:
+        return f", and so nothing for environment {array.shape[0]}"
+    if array.ndim and array.shape[1:] != shape[1:]:
+        return ", from environment 0 on"
+    return ""
+
+
+def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
+    """
+    :param what: what the values are
+    :param values: a row for each of ``envs``
+    :param envs: the environments that returned them
+    :raises ValueError: if a value is not finite; the message says where
+    """
+    finite = np.isfinite(values)
+    if not finite.all():
+        row, *component = np.argwhere(~finite)[0].tolist()
+        where = f" in component {component[0]}" if component else ""
+        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
+
+
+def check_transition(observations: np.ndarray, rewards: np.ndarray) -> None:
+    """
+    :param observations: a row for each environment
+    :param rewards: one for each environment
+    :raises ValueError: if an observation or reward is not finite; the message says where
+    """
+    check_finite("an observation", observations, range(len(rewards)))
+    check_finite("a reward", rewards, range(len(rewards)))
