@@ -19,8 +19,9 @@ from toy_envs import StillEnv
 
 from sb3_knntd import KNNTD
 from sb3_knntd.kernels.nearest import nearest_of_all
-from sb3_knntd.perception import Lattice, Points, Scattered, make_bounds
+from sb3_knntd.perception import Lattice, Perceiver, Points, Scattered, make_bounds
 from sb3_knntd.perception.search import SEARCHES, Neighbors, Search
+from sb3_knntd.perception.weights import InverseQuadratic
 
 PROPERTY = settings(max_examples=30, deadline=None, derandomize=True)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -52,7 +53,7 @@ def assert_same(got: Neighbors, expected: Neighbors) -> None:
 
 def compiled_brute(points: Points, k: int, scaled: np.ndarray) -> Neighbors:
     """The search over all points that the compiled step has in it."""
-    columns = fitted("brute", points, k).kernel_arguments()[3]
+    columns = fitted("brute", points, k).kernel_arguments().columns
     indices, distances = np.empty((len(scaled), k), np.int64), np.empty((len(scaled), k))
     for row, x in enumerate(scaled):
         nearest_of_all(x, columns, k, indices[row], distances[row])
@@ -258,6 +259,28 @@ def test_kd_tree(seed: int, n_dims: int, n_points: int, data: st.DataObject) -> 
     assert_same(query("brute", points, k, scaled), expected)
     assert_same(query("kd_tree", points, k, scaled), expected)
     assert_same(compiled_brute(points, k, scaled), expected)
+
+
+@given(seed=SEEDS, n_dims=st.integers(1, 4), sizes=st.lists(st.integers(1, 25), min_size=2, max_size=4), data=st.data())
+@PROPERTY
+def test_points_that_are_added(seed: int, n_dims: int, sizes: list[int], data: st.DataObject) -> None:
+    rng = np.random.default_rng(seed)
+    # Many are at equal distances, or in one place.
+    places = rng.integers(-4, 5, (sum(sizes), n_dims)) / 4
+    scaled = np.concatenate((rng.uniform(-1.5, 1.5, (8, n_dims)), rng.integers(-10, 11, (8, n_dims)) / 8))
+    k = data.draw(st.integers(1, sizes[0]))
+    bounds = make_bounds(unit_bounds(n_dims), spaces.Box(-1.0, 1.0, (n_dims,), np.float64))
+    for name in ("brute", "kd_tree"):
+        points = Scattered(places[: sizes[0]])
+        perceiver = Perceiver(bounds, points, SEARCHES[name](points, k), InverseQuadratic())
+        first = sizes[0]
+        for size in sizes[1:]:
+            added = perceiver.add_points(places[first : first + size])
+            assert added.tolist() == list(range(first, first + size))
+            first += size
+            expected = by_hand(places[:first], k, scaled)
+            assert_same(perceiver.find(th.from_numpy(scaled)), expected)
+            assert_same(compiled_brute(points, k, scaled), expected)
 
 
 @pytest.mark.parametrize("n_dims", [1, 3])

@@ -52,6 +52,15 @@ def check_rate(
     return check_schedule(name, value, low, high, above=above)  # type: ignore[arg-type]
 
 
+def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
+    """
+    :param num_timesteps: steps so far; with several environments they can exceed the total
+    :param total_timesteps: total number of steps
+    :return: the remaining fraction, from 1 to 0
+    """
+    return 1.0 - num_timesteps / total_timesteps if num_timesteps < total_timesteps else 0.0
+
+
 def make_schedule(value: float | Schedule | str) -> FloatSchedule:
     """
     :param value: number, schedule, or word for one, checked

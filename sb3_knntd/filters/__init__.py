@@ -1,4 +1,4 @@
-"""The δs filter (Algorithm 5 of the paper): noisy observations in, estimates of the state out."""
+"""The δs filter (Algorithm 5 of the paper), which estimates the state from noisy observations."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import torch as th
 from sb3_knntd.common.checks import check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
-from sb3_knntd.filters.table import Arguments, DeltaTable
+from sb3_knntd.filters.table import DeltaTable, FilterArguments
 
 
 class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs):
@@ -82,29 +82,14 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
         training: bool = True,
         compiled: bool = True,
     ) -> None:
+        arguments = FilterArguments.of(locals())
         training = check_flag("training", training)
-        arguments = Arguments(
-            learning_rate=learning_rate,
-            update=update,
-            reference=reference,
-            gain=gain,
-            warmup=warmup,
-            n_neighbors=n_neighbors,
-            points=points,
-            bounds=bounds,
-            weights=weights,
-            bandwidth=bandwidth,
-            search=search,
-            action_points=action_points,
-            total_timesteps=total_timesteps,
-            compiled=compiled,
-        )
-        gym.utils.RecordConstructorArgs.__init__(self, **arguments._asdict(), training=training)
-        gym.Wrapper.__init__(self, env)
-        self._set_up(DeltaTable(env.observation_space, env.action_space, arguments), training)
+        self._set_up(env, DeltaTable(env.observation_space, env.action_space, arguments), training)
 
-    def _set_up(self, table: DeltaTable, training: bool) -> None:
-        #: what is learned
+    def _set_up(self, env: gym.Env[np.ndarray, Any], table: DeltaTable, training: bool) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, **table.arguments.to_dict(), training=training)
+        gym.Wrapper.__init__(self, env)
+        #: what was learned
         self.table = table
         #: whether to learn
         self.training = training
@@ -181,7 +166,5 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
     @classmethod
     def _around(cls, env: gym.Env[np.ndarray, Any], table: DeltaTable, training: bool) -> DeltaFilter:
         around = cls.__new__(cls)
-        gym.utils.RecordConstructorArgs.__init__(around, **table.arguments._asdict(), training=training)
-        gym.Wrapper.__init__(around, env)
-        around._set_up(table, training)
+        around._set_up(env, table, training)
         return around

@@ -1,4 +1,4 @@
-"""A filter as a file."""
+"""Saving and loading of filters."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from stable_baselines3.common.save_util import is_json_serializable, load_from_z
 
 from sb3_knntd.common.files import read_description, replacing
 from sb3_knntd.common.plain import encodable, objects_for
-from sb3_knntd.filters.table import Arguments, DeltaTable
+from sb3_knntd.filters.table import DeltaTable, FilterArguments
 
-#: What a file says that it holds.
+#: Marks a file as that of a filter.
 CONTENT = "sb3_knntd filter"
 
 
 def save_table(path: str | pathlib.Path, table: DeltaTable, training: bool) -> None:
     """
-    Save what a filter has learned, and its parameters. It is written beside the old file and renamed, so that
-    whatever interrupts it leaves a whole file.
+    Save what a filter has learned, and its parameters. The file is written under another name and renamed: an
+    interruption leaves a complete file.
 
     :param path: file, with ``.zip`` added if it has no suffix
-    :param table: what was learned
-    :param training: whether it was learning
+    :param table: the table
+    :param training: whether the filter is training
     """
     target = pathlib.Path(path)
     if not target.suffix:
@@ -31,7 +31,7 @@ def save_table(path: str | pathlib.Path, table: DeltaTable, training: bool) -> N
     target.parent.mkdir(parents=True, exist_ok=True)
     data: dict[str, Any] = {
         "content": CONTENT,
-        "arguments": table.arguments._asdict(),
+        "arguments": table.arguments.to_dict(),
         "observation_space": table.observation_space,
         "action_space": table.action_space,
         "bounds_from_space": table.bounds_from_space,
@@ -47,12 +47,12 @@ def load_table(
 ) -> tuple[DeltaTable, bool]:
     """
     :param path: file
-    :param observation_space: of the environment to be filtered
-    :param action_space: likewise
-    :param trusted: whether to unpickle what it holds besides data
-    :return: what was learned, and whether it was learning
-    :raises ValueError: if the file is damaged, holds something else, or is of other spaces; without trust also if it
-        holds functions, which are there only as pickles
+    :param observation_space: observation space of the environment to filter
+    :param action_space: action space of it
+    :param trusted: whether to unpickle objects in the file that are not plain data
+    :return: the table, and whether the filter was training
+    :raises ValueError: if the file is damaged, holds something else, or is for other spaces; without ``trusted`` also
+        if it holds functions, which are pickled
     """
     description = read_description(path)
     if description.get("content") != CONTENT:
@@ -61,11 +61,11 @@ def load_table(
     data, params, _ = load_from_zip_file(path, custom_objects=objects, device="cpu")
     assert data is not None
     saved = data["observation_space"], data["action_space"]
-    table = DeltaTable(*saved, Arguments(**data["arguments"]), data["bounds_from_space"])
+    table = DeltaTable(*saved, FilterArguments(**data["arguments"]), data["bounds_from_space"])
     table.check_spaces(observation_space, action_space)
     state: dict[str, Any] = params["filter"]  # type: ignore[assignment]
     try:
         table.load_state_dict(state)
-    except RuntimeError as error:  # torch's, of bounds that do not fit
+    except RuntimeError as error:  # torch raises it for bounds that do not fit
         raise ValueError(f"{path}: {error}") from error
     return table, data["training"]

@@ -1,16 +1,16 @@
-"""What the filter learns: how the state changes, by state and action."""
+"""The table of expected changes of the state that the filter learns."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.actions.columns import make_action_columns
-from sb3_knntd.base import progress_remaining
 from sb3_knntd.common.checks import (
     check_flag,
     check_integer,
@@ -21,45 +21,54 @@ from sb3_knntd.common.checks import (
     check_word,
     shown,
 )
+from sb3_knntd.common.schedules import progress_remaining
 from sb3_knntd.common.state_checks import checked_integer, checked_points, checked_tensor
-from sb3_knntd.kernels.filter import ADAPTIVE, COUNT, FIXED, OF_UPDATE
-from sb3_knntd.perception import Perceiver, make_bounds, make_points, make_weights
+from sb3_knntd.kernels.delta_filter import COUNT, DeltaTableArrays, GainRule, InnovationStatistics
+from sb3_knntd.perception import PerceptionConfig, make_perceiver
 from sb3_knntd.perception.bounds import steps_to_measure
-from sb3_knntd.perception.points import AUTO_POINTS_PER_DIMENSION, count_neighbors
-from sb3_knntd.perception.search import make_search
+from sb3_knntd.perception.points import AUTO_POINTS_PER_DIMENSION
 
-#: ``points="auto"``: a lattice of about this many points, fewer than a learner's: each entry has to average noise.
+#: ``points="auto"``: approximate number of points of the lattice. A learner has more; here each entry averages noise.
 AUTO_POINTS = 2000
 
 
-class Arguments(NamedTuple):
-    """The parameters of :class:`~sb3_knntd.DeltaFilter`, as they were given."""
+@dataclass(frozen=True, kw_only=True)
+class FilterArguments(PerceptionConfig):
+    """The parameters of :class:`~sb3_knntd.DeltaFilter` besides ``env`` and ``training``, as they were given."""
 
     learning_rate: float | str | Callable[[float], float]
     update: str | None
     reference: str
     gain: Any
     warmup: float
-    n_neighbors: int | str
-    points: Any
-    bounds: Any
-    weights: str | Callable[[th.Tensor], Any]
-    bandwidth: float
-    search: str
     action_points: Any
     total_timesteps: int | None
     compiled: bool
 
+    @classmethod
+    def of(cls, parameters: Mapping[str, Any]) -> FilterArguments:
+        """
+        :param parameters: the parameters of a filter's constructor and their values; others are ignored
+        :return: the arguments
+        """
+        return cls(**{field.name: parameters[field.name] for field in fields(cls)})
+
+    def to_dict(self) -> dict[str, Any]:
+        """
+        :return: the values by name, not copied
+        """
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
 
 class DeltaTable:
     """
-    The expected change δ(i, a) of the state at each point for each action (eq. 28), how often each entry was visited,
-    and what the innovations were like.
+    The expected change δ(i, a) of the state at each point for each action (eq. 28), the visits of each entry, and
+    statistics of the innovations.
 
     :param observation_space: Box of shape (obs_dim,)
     :param action_space: Discrete, or Box with finite bounds
     :param arguments: see :class:`~sb3_knntd.DeltaFilter`
-    :param bounds_from_space: whether the observation space tells the range of the observations
+    :param bounds_from_space: whether the bounds of the observation space hold
     :raises ValueError: if an argument or a space does not fit; the message says which, and what would
     """
 
@@ -67,7 +76,7 @@ class DeltaTable:
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
-        arguments: Arguments,
+        arguments: FilterArguments,
         bounds_from_space: bool = True,
     ) -> None:
         box = _check_observation_space(observation_space)
@@ -78,14 +87,14 @@ class DeltaTable:
         self.obs_dim = box.shape[0]
         self._check_arguments()
 
-        #: action points in shares of the space's width, for Box actions
+        #: action points as fractions of the space's width, for Box actions
         self._action_points, self._action_width = np.empty((0, 0)), np.empty(0)
         if isinstance(action_space, spaces.Discrete):
             n_columns = int(action_space.n)
         elif isinstance(action_space, spaces.Box):
             points = make_action_columns(action_space, arguments.action_points, "joint").points
             width = action_space.high.astype(np.float64) - action_space.low
-            # A dimension that is fixed has all its points in one place.
+            # In a dimension of no width all points are the same.
             self._action_width = np.where(width > 0, width, 1.0).reshape(-1)
             self._action_points = points / self._action_width
             n_columns = len(points)
@@ -97,30 +106,28 @@ class DeltaTable:
 
         per_dimension = min(AUTO_POINTS_PER_DIMENSION, max(2, round(AUTO_POINTS ** (1 / self.obs_dim))))
         is_auto = isinstance(arguments.points, str) and arguments.points == "auto"
-        places = make_points(per_dimension if is_auto else arguments.points, box)
-        n_neighbors = count_neighbors(arguments.n_neighbors, box, places.n_points, self.obs_dim)
-        self.perceiver = Perceiver(
-            make_bounds(arguments.bounds, box, from_space=bounds_from_space),
-            places,
-            make_search(arguments.search, places, n_neighbors),
-            make_weights(arguments.weights, arguments.bandwidth, n_neighbors),
-        )
+        config = replace(arguments, points=per_dimension) if is_auto else arguments
+        self.perceiver = make_perceiver(config, box, bounds_from_space=bounds_from_space)
+        n_points = self.perceiver.points.n_points
         check_size(
-            f"points: a table of {places.n_points:,} points and {n_columns:,} actions",
-            places.n_points * n_columns * (self.obs_dim + 1) * 8,
+            f"points: a table of {n_points:,} points and {n_columns:,} actions",
+            n_points * n_columns * (self.obs_dim + 1) * 8,
             "give fewer points, 1 for dimensions that the changes do not depend on, or fewer action_points",
         )
         #: expected changes, shape (n_points, n_columns, obs_dim), observation units
-        self.deltas = np.zeros((places.n_points, n_columns, self.obs_dim))
-        #: visits, each shared among the neighbours as they count, shape (n_points, n_columns)
-        self.visits = np.zeros((places.n_points, n_columns))
-        #: what the adapted gain settles at, shape (obs_dim,). 1 until noise shows: observations pass as they are
+        self.deltas = np.zeros((n_points, n_columns, self.obs_dim))
+        #: visits, each divided among the neighbours by their probabilities, shape (n_points, n_columns)
+        self.visits = np.zeros((n_points, n_columns))
+        #: the stationary gain, shape (obs_dim,). 1 until noise is observed: observations pass unchanged
         self.gains = np.ones(self.obs_dim)
         self.variances = np.zeros(self.obs_dim)
         self.counts = np.zeros(1)
+        #: these arrays as the kernel takes them
+        self.arrays = tuple(DeltaTableArrays(deltas=self.deltas, visits=self.visits))
+        self.statistics = tuple(InnovationStatistics(gains=self.gains, variances=self.variances, counts=self.counts))
         self.n_measured = 0
         self.n_steps = 0
-        # Asking the bounds takes as long as the rest of a step.
+        # To ask the bounds in each step would double its time.
         self._is_open = self.perceiver.bounds.is_open
 
     def _check_arguments(self) -> None:
@@ -144,7 +151,7 @@ class DeltaTable:
         check_flag("compiled", given.compiled)
         self.averaging = counts if given.update is None else given.update == "averaging"
 
-        self.gain, self.fixed_gain = OF_UPDATE, np.zeros(self.obs_dim)
+        self.gain_rule, self.fixed_gain = GainRule.OF_UPDATE, np.zeros(self.obs_dim)
         if isinstance(given.gain, str):
             check_word("gain, if it is no number,", given.gain, ["adaptive"])
             if given.reference == "observed":
@@ -152,9 +159,9 @@ class DeltaTable:
                     "gain='adaptive' needs reference='filtered': innovations tell of the gain only where they start "
                     "from the last estimate. With reference='observed' give None, or a number in (0, 1]"
                 )
-            self.gain = ADAPTIVE
+            self.gain_rule = GainRule.ADAPTIVE
         elif given.gain is not None:
-            self.gain, self.fixed_gain = FIXED, self._check_gain(given.gain)
+            self.gain_rule, self.fixed_gain = GainRule.FIXED, self._check_gain(given.gain)
         elif counts and given.reference == "filtered":
             raise ValueError(
                 "gain=None lets the update of the table alone bring the estimate back to what is observed, which "
@@ -176,9 +183,9 @@ class DeltaTable:
 
     def check_spaces(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         """
-        :param observation_space: of an environment to be filtered
-        :param action_space: likewise
-        :raises ValueError: if they are not those that the filter was made for
+        :param observation_space: observation space of an environment to filter
+        :param action_space: action space of it
+        :raises ValueError: if the spaces are not those of the filter
         """
         for name, own, given in (
             ("observation", self.observation_space, observation_space),
@@ -193,7 +200,7 @@ class DeltaTable:
     def columns(self, actions: Any) -> np.ndarray:
         """
         :param actions: actions of the environments, shape (n_envs, *action_shape)
-        :return: the columns that stand for them, the nearest action points for Box actions, shape (n_envs,), int64
+        :return: their columns of the table, those of the nearest action points for Box actions, shape (n_envs,), int64
         :raises ValueError: if an action is not in the space
         """
         space = self.action_space
@@ -211,7 +218,7 @@ class DeltaTable:
 
     def rate(self) -> float:
         """
-        :return: α now, or ``COUNT``
+        :return: the current α, or ``COUNT``
         """
         rate = self.arguments.learning_rate
         if isinstance(rate, str):
@@ -224,21 +231,22 @@ class DeltaTable:
     def must_measure(self, n_envs: int) -> bool:
         """
         :param n_envs: number of environments
-        :return: whether the range of some dimension is still to be found
+        :return: whether the range of some dimension is still to be measured
         """
         return self._is_open and self.n_measured < steps_to_measure(n_envs)
 
     def measure(self, observations: np.ndarray) -> None:
         """
-        :param observations: shape (n_envs, obs_dim), finite; they widen the range of the open dimensions
+        Widen the range of the open dimensions to include these observations.
+
+        :param observations: shape (n_envs, obs_dim), finite
         """
         self.perceiver.measure(th.from_numpy(observations))
         self.n_measured += len(observations)
 
     def follow(self, estimates: np.ndarray) -> None:
         """
-        Widen adaptive bounds where estimates lie beyond them. Where points move, each is given what was
-        there.
+        Widen adaptive bounds to include these estimates. Points that move get the values that were at their new place.
 
         :param estimates: shape (n_envs, obs_dim)
         """
@@ -252,7 +260,7 @@ class DeltaTable:
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: all that was learned, as tensors and numbers; of the table the rows that were visited
+        :return: everything that was learned, as tensors and numbers; of the table the rows that were visited
         """
         visited = np.flatnonzero(self.visits.any(axis=1))
         arrays = {
@@ -272,8 +280,8 @@ class DeltaTable:
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """
-        :param state_dict: of a table with the same spaces and arguments
-        :raises ValueError: if no such table can have returned it
+        :param state_dict: the state of a table with the same spaces and arguments
+        :raises ValueError: if it cannot be the state of such a table
         """
         points = checked_points(state_dict, "points", len(self.deltas))
         shape = (len(points), *self.visits.shape[1:])

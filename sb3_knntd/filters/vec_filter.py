@@ -12,11 +12,10 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_knntd.common.checks import check_flag
+from sb3_knntd.common.checks import check_finite, check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
-from sb3_knntd.filters.table import Arguments, DeltaTable
-from sb3_knntd.learners.base import check_finite
+from sb3_knntd.filters.table import DeltaTable, FilterArguments
 
 
 class VecDeltaFilter(VecEnvWrapper):
@@ -63,23 +62,8 @@ class VecDeltaFilter(VecEnvWrapper):
         training: bool = True,
         compiled: bool = True,
     ) -> None:
+        arguments = FilterArguments.of(locals())
         training = check_flag("training", training)
-        arguments = Arguments(
-            learning_rate=learning_rate,
-            update=update,
-            reference=reference,
-            gain=gain,
-            warmup=warmup,
-            n_neighbors=n_neighbors,
-            points=points,
-            bounds=bounds,
-            weights=weights,
-            bandwidth=bandwidth,
-            search=search,
-            action_points=action_points,
-            total_timesteps=total_timesteps,
-            compiled=compiled,
-        )
         normalize = unwrap_vec_normalize(venv)
         normalizes = normalize is not None and normalize.norm_obs
         if normalizes:

@@ -12,15 +12,15 @@ from torch import nn
 from sb3_knntd.common.checks import check_numbers, shown
 from sb3_knntd.common.state_checks import checked_tensor
 
-#: A bound beyond this is taken for "none": no sensor spans it, and a lattice over it resolves nothing.
+#: A larger bound counts as no bound: no sensor spans such a range, and no lattice resolves it.
 LARGEST_SENSIBLE_BOUND = 1e10
-#: A range is widened by this share beyond what was seen, since a better policy sees more than a random one.
+#: A measured range is widened by this fraction on each side, since a better policy reaches states that a random one
+#: does not.
 MARGIN = 0.25
-#: Scaled values end here, far outside of any point, so that no distance swallows the differences of others.
+#: Scaled values are clipped to this size. It is far outside all points, and small enough that a squared distance still
+#: resolves the differences in the other dimensions.
 FARTHEST = 1e4
-
-
-#: Observations that the range of an open dimension is taken from: in all, and of each environment.
+#: Number of observations that the range of an open dimension is measured over, in total and per environment.
 MEASURING_STEPS = 1000
 MEASURING_STEPS_PER_ENV = 100
 
@@ -28,23 +28,23 @@ MEASURING_STEPS_PER_ENV = 100
 def steps_to_measure(n_envs: int) -> int:
     """
     :param n_envs: number of environments
-    :return: how many observations the range of an open dimension is taken from
+    :return: number of observations that the range of an open dimension is measured over
     """
     return max(MEASURING_STEPS, MEASURING_STEPS_PER_ENV * n_envs)
 
 
 class Bounds(nn.Module):
     """
-    Affine map of each observation dimension onto [-1, 1] (eq. 4 of the paper). Values outside are kept, up to 10,000.
+    Affine map of each observation dimension onto [-1, 1] (eq. 4 of the paper). Observations outside the bounds are
+    mapped to values outside [-1, 1], clipped to ±10,000.
 
-    A dimension whose bounds are infinite, larger than 1e10 or empty (low >= high) is *open*: it stands at
-    [-1, 1] until :meth:`measure` has seen observations, then at their range, widened by a quarter on either side.
-    *Adaptive* bounds are open in all dimensions, and :meth:`widen` whenever an observation lies beyond them, up to
-    the bounds given.
+    A dimension whose bounds are infinite, larger than 1e10 or empty (low >= high) is *open*: its range is [-1, 1] until
+    :meth:`measure` is called, and then that of the observations, widened by a quarter on each side. *Adaptive* bounds
+    are open in all dimensions, and :meth:`widen` moves them when an observation lies outside, up to the bounds given.
 
     :param low: lower bounds, shape (obs_dim,), observation units
     :param high: upper bounds, shape (obs_dim,), observation units
-    :param adaptive: whether the bounds are to follow the observations
+    :param adaptive: whether the bounds follow the observations
     """
 
     low: th.Tensor
@@ -72,7 +72,7 @@ class Bounds(nn.Module):
         self.register_buffer("seen_high", th.full_like(self.low, -th.inf))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        # What is missing torch tells of.
+        # torch reports missing entries.
         if all(prefix + name in state_dict for name in self.state_dict()):
             shape = (self.obs_dim,)
             low, high = (checked_tensor(state_dict, prefix + name, shape) for name in ("low", "high"))
@@ -84,19 +84,19 @@ class Bounds(nn.Module):
 
     @property
     def is_open(self) -> bool:
-        """Whether some dimension has no range of its own and has to be measured."""
+        """Whether the range of some dimension has to be measured."""
         return bool(self.open.any())
 
     def measure(self, observations: th.Tensor) -> None:
         """
-        Widen the range of the open dimensions to take in these observations.
+        Widen the range of the open dimensions to include these observations.
 
         :param observations: shape (batch, obs_dim), finite
         """
         self.seen_low.copy_(th.minimum(self.seen_low, observations.amin(dim=0)))
         self.seen_high.copy_(th.maximum(self.seen_high, observations.amax(dim=0)))
         width = self.seen_high - self.seen_low
-        # A dimension that has not moved yet gets a range of one unit on either side.
+        # A dimension that was constant so far gets one unit on each side.
         margin = th.where(width > 0, MARGIN * width, 1.0)
         self._set(
             th.where(self.open, self.seen_low - margin, self.low),
@@ -105,7 +105,7 @@ class Bounds(nn.Module):
 
     def widen(self, observations: th.Tensor) -> None:
         """
-        Take in these observations on the sides that they lie beyond, and a quarter of the range more.
+        Move the bounds that these observations exceed to include them, and by a quarter of the range more.
 
         :param observations: shape (batch, obs_dim), finite
         """
@@ -119,8 +119,8 @@ class Bounds(nn.Module):
 
     def reach(self) -> tuple[th.Tensor, th.Tensor]:
         """
-        :return: beyond which observations :meth:`widen` would move a bound, low and high, each of shape (obs_dim,);
-            infinite where a bound stands at the last that it may take
+        :return: the values (low, high) beyond which :meth:`widen` moves a bound, each of shape (obs_dim,), observation
+            units; infinite where a bound has reached its limit
         """
         low = th.where(self.low > self.lowest, self.low, -th.inf)
         return low, th.where(self.high < self.highest, self.high, th.inf)
@@ -132,14 +132,14 @@ class Bounds(nn.Module):
     def scale(self, observations: th.Tensor) -> th.Tensor:
         """
         :param observations: shape (..., obs_dim), observation units
-        :return: the same in scaled units, [-1, 1] within the bounds (eq. 4)
+        :return: the observations in scaled units, in [-1, 1] within the bounds (eq. 4)
         """
         return (2.0 * ((observations - self.low) / (self.high - self.low)) - 1.0).clamp(-FARTHEST, FARTHEST)
 
     def unscale(self, scaled: th.Tensor) -> th.Tensor:
         """
         :param scaled: shape (..., obs_dim), scaled units
-        :return: the same in observation units
+        :return: the values in observation units
         """
         return self.low + 0.5 * (scaled + 1.0) * (self.high - self.low)
 
@@ -147,8 +147,8 @@ class Bounds(nn.Module):
 def count_states(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
     """
     :param observation_space: Discrete, or MultiDiscrete or MultiBinary of one axis
-    :return: the first state of each of its components and how many there are, each of shape (obs_dim,)
-    :raises TypeError: if it is of another kind
+    :return: the first state and the number of states of each component, each of shape (obs_dim,)
+    :raises TypeError: if the space is not one of these
     """
     if isinstance(observation_space, spaces.Discrete):
         return np.array([observation_space.start]), np.array([observation_space.n])
@@ -161,11 +161,11 @@ def count_states(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.n
 
 def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space: bool = True) -> Bounds:
     """
-    :param bounds: ``None`` for the space's own, ``"adaptive"`` to follow the observations within the space's own, or
-        a pair (low, high) of arrays of shape (obs_dim,) in observation units
+    :param bounds: ``None`` for the bounds of the space, ``"adaptive"`` to follow the observations within the bounds of
+        the space, or a pair (low, high) of arrays of shape (obs_dim,) in observation units
     :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
-    :param from_space: whether the space tells the range; with VecNormalize around the environment it does
-        not, and all dimensions are open unless ``bounds`` are given
+    :param from_space: whether the bounds of the space hold. They do not for an environment wrapped in VecNormalize;
+        then all dimensions are open unless ``bounds`` are given
     :return: the bounds
     :raises ValueError: if ``bounds`` has another form, is not finite, or low >= high somewhere
     """
@@ -211,6 +211,6 @@ def _bounds_of(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.nda
     if isinstance(observation_space, spaces.Box):
         return observation_space.low.astype(np.float64), observation_space.high.astype(np.float64)
     first, counts = count_states(observation_space)
-    # A lattice has its only point in the middle; a dimension with a single state has it at that state.
-    alone = (counts == 1).astype(np.float64)
-    return first - alone, first + np.maximum(counts - 1, 1)
+    # The only point of a dimension is in the middle of its range: for a single state, that state.
+    single = (counts == 1).astype(np.float64)
+    return first - single, first + np.maximum(counts - 1, 1)

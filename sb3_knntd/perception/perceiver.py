@@ -1,4 +1,4 @@
-"""Where am I? From an observation to a distribution over its nearest points."""
+"""From an observation to a distribution over its nearest points."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch as th
 from torch import nn
 
 from sb3_knntd.common.tracing import is_traced
-from sb3_knntd.kernels.perceive import FOUND, are_within
+from sb3_knntd.kernels.perceive import PerceptionArguments, SearchKind, are_within
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
-from sb3_knntd.perception.points import Lattice, Points
+from sb3_knntd.perception.points import Lattice, Points, Scattered
 from sb3_knntd.perception.search import Neighbors, Search
 from sb3_knntd.perception.search.base import nearest_by_tensors
 from sb3_knntd.perception.weights import KernelWeights, Weights
@@ -20,10 +20,10 @@ from sb3_knntd.perception.weights import KernelWeights, Weights
 
 class Perception(NamedTuple):
     """
-    What an observation is to the learner (eqs. 5 and 6 of the paper).
+    The nearest points of each observation and their probabilities (eqs. 5 and 6 of the paper).
 
     :param indices: the k nearest points, nearest first, shape (batch, k), int64
-    :param probabilities: how much each counts, rows sum to 1, shape (batch, k), float64
+    :param probabilities: their probabilities, rows sum to 1, shape (batch, k), float64
     """
 
     indices: th.Tensor
@@ -34,8 +34,8 @@ class Regridding:
     """
     A lattice before and after its bounds were widened.
 
-    :param perceiver: as it is now
-    :param before: the bounds as they were
+    :param perceiver: the perceiver with the new bounds
+    :param before: the old bounds
     """
 
     def __init__(self, perceiver: Perceiver, before: Bounds) -> None:
@@ -45,8 +45,8 @@ class Regridding:
     def sources(self, indices: th.Tensor) -> Perception:
         """
         :param indices: points, shape (n,), int64
-        :return: what an observation at the place where each now is would have been before: a function of the
-            observations is carried over by giving each point the value that the function had there
+        :return: the perception, with the old bounds, of an observation at the new place of each point. The mean of a
+            function of the points over it is the value to give to that point
         """
         after = self._perceiver.bounds
         places = after.unscale(self._perceiver.points.coordinates(after, indices))
@@ -55,7 +55,7 @@ class Regridding:
     def targets(self, indices: th.Tensor) -> th.Tensor:
         """
         :param indices: points, shape (n,), int64
-        :return: the point that is now nearest to the place where each was, shape (n,), int64
+        :return: the point whose new place is nearest to the old place of each, shape (n,), int64
         """
         places = self._before.unscale(self._perceiver.points.coordinates(self._before, indices))
         return self._perceiver.perceive_scaled(self._perceiver.bounds.scale(places)).indices[:, 0]
@@ -67,15 +67,16 @@ class Perceiver(nn.Module):
 
     :param bounds: the range that is mapped to [-1, 1]
     :param points: the points
-    :param search: finds the neighbours among ``points``
-    :param weights: weighs them by distance
+    :param search: finds the nearest of ``points``
+    :param weights: weights the neighbours by distance
     """
 
-    #: ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`; ``None`` on an accelerator or with weights that are a
-    #: function, where no kernel can be used
-    eyes: tuple[Any, ...] | None
-    #: whether neighbours have to be found before a kernel is called
+    #: arguments of the kernels; ``None`` where they cannot be used: on an accelerator, or if the weights are a function
+    arguments: PerceptionArguments | None
+    #: whether the neighbours have to be found before a kernel is called
     search_is_outside: bool
+    #: increases with each :meth:`fit`: whoever holds ``arguments`` has to take the new ones
+    version: int
 
     def __init__(self, bounds: Bounds, points: Points, search: Search, weights: Weights) -> None:
         super().__init__()
@@ -83,21 +84,46 @@ class Perceiver(nn.Module):
         self.points = points
         self.search = search
         self.weights = weights
+        self.version = 0
         self.fit()
 
     def fit(self) -> None:
-        """Bring the search up to date with the bounds and their device."""
+        """Update what depends on the bounds, their device and the points. Has to be called when one of them changed."""
         self.search.fit(self.bounds)
         self._reach = [bound.cpu().numpy() for bound in self.bounds.reach()]
-        self.eyes = self._make_eyes()
-        self.search_is_outside = self.eyes is not None and self.eyes[3] == FOUND
+        self.arguments = self._make_arguments()
+        self.search_is_outside = self.arguments is not None and self.arguments.search == SearchKind.OUTSIDE
+        self.version += 1
 
-    def _make_eyes(self) -> tuple[Any, ...] | None:
+    def _make_arguments(self) -> PerceptionArguments | None:
         if not isinstance(self.weights, KernelWeights) or not self.bounds.low.is_cpu:
             return None
         low, high = self.bounds.low.numpy(), self.bounds.high.numpy()
-        weights = (self.weights.KERNEL, self.weights.bandwidth)
-        return (low, high - low, FARTHEST, *self.search.kernel_arguments(), *weights)
+        return PerceptionArguments(
+            low=low,
+            width=high - low,
+            limit=FARTHEST,
+            weighting=int(self.weights.WEIGHTING),
+            bandwidth=self.weights.bandwidth,
+            **self.search.kernel_arguments()._asdict(),
+        )
+
+    def add_points(self, points: Any) -> th.Tensor:
+        """
+        Add points to scattered ones. The Q-table needs a row for each.
+
+        :param points: places of the new points, shape (n, obs_dim), observation units, finite
+        :return: the indices of the new points, shape (n,), int64
+        :raises ValueError: if the points form a lattice, or the places have another shape or are not finite
+        """
+        if not isinstance(self.points, Scattered):
+            raise ValueError(
+                "points can be added to scattered points only; these form a lattice. Give points as an array of shape "
+                f"(n_points, {self.points.obs_dim})"
+            )
+        added = self.points.append(points)
+        self.fit()
+        return added
 
     def find(self, observations: th.Tensor) -> Neighbors:
         """
@@ -108,7 +134,7 @@ class Perceiver(nn.Module):
 
     def measure(self, observations: th.Tensor) -> None:
         """
-        Widen the bounds of the open dimensions to take in these observations.
+        Widen the bounds of the open dimensions to include these observations.
 
         :param observations: shape (batch, *obs_shape), any number type
         """
@@ -118,16 +144,16 @@ class Perceiver(nn.Module):
     def sees(self, observations: np.ndarray) -> bool:
         """
         :param observations: shape (batch, *obs_shape), any number type, observation units
-        :return: whether there is nothing to :meth:`widen`: all lie within the bounds, or beyond those that cannot move
+        :return: whether :meth:`widen` would change nothing: all lie within the bounds that can still move
         """
         return bool(are_within(observations.reshape(-1, self.bounds.obs_dim), *self._reach))
 
     def widen(self, observations: th.Tensor) -> Regridding | None:
         """
-        Widen adaptive bounds to take in these observations.
+        Widen adaptive bounds to include these observations.
 
         :param observations: shape (batch, *obs_shape), any number type
-        :return: where the points were and are; ``None`` if they are scattered, and have stayed where they were
+        :return: the old and new places of the points; ``None`` for scattered points, which do not move
         """
         before = copy.deepcopy(self.bounds)
         self.bounds.widen(self._flat(observations))
@@ -156,3 +182,10 @@ class Perceiver(nn.Module):
 
     def _flat(self, observations: th.Tensor) -> th.Tensor:
         return observations.reshape(-1, self.bounds.obs_dim).to(self.bounds.low)
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        name, k = prefix + "points.places", self.search.n_neighbors
+        places = state_dict.get(name)
+        if isinstance(places, th.Tensor) and places.shape[:1] < (k,):
+            raise ValueError(f"{name} must have at least n_neighbors={k} rows; got shape {tuple(places.shape)}")
+        super()._load_from_state_dict(state_dict, prefix, *args)

@@ -1,4 +1,4 @@
-"""The perception points: where the table has its rows."""
+"""The perception points: each is a row of the Q-table."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from torch import nn
 
 from sb3_knntd.common.checks import check_integer, check_numbers, check_size, shown
+from sb3_knntd.common.state_checks import checked_tensor
 from sb3_knntd.perception.bounds import Bounds, count_states
 
-#: ``points="auto"``: a lattice of about this many points in all, with at most so many in a dimension.
+#: ``points="auto"``: approximate number of points of the lattice, and the largest number in one dimension.
 AUTO_POINTS = 8000
 AUTO_POINTS_PER_DIMENSION = 20
 
 
 class Points(ABC):
-    """A set of points, numbered from 0, at fixed places."""
+    """A set of points, numbered from 0."""
 
     #: number of points
     n_points: int
@@ -31,18 +33,18 @@ class Points(ABC):
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
         """
         :param bounds: the range that is mapped to [-1, 1]
-        :param indices: which points, shape (n,), int64; all of them if not given
-        :return: their places in scaled units, shape (n, obs_dim), float64
+        :param indices: points, shape (n,), int64; all points by default
+        :return: their coordinates in scaled units, shape (n, obs_dim), float64
         """
 
 
 class Lattice(Points):
     """
-    A regular lattice over [-1, 1] in every scaled dimension, end points included, numbered in C order
-    (the last dimension runs fastest). Only its axes are kept in memory. One point in a dimension sits in
-    the middle of it.
+    A regular lattice over [-1, 1] in each scaled dimension, including both ends, numbered in C order (the last
+    dimension varies fastest). The only point of a dimension is in its middle. Only the axes are stored.
 
     :param shape: number of points in each dimension
+    :raises ValueError: if the points are too many to be numbered, or the axes too large for the memory
     """
 
     def __init__(self, shape: Sequence[int]) -> None:
@@ -54,7 +56,7 @@ class Lattice(Points):
                 f"points: a lattice can have up to 2^63 - 1 points; got {self.shape}, which are {self.n_points:.3g}. "
                 "Give fewer points a dimension, 1 for dimensions that matter little"
             )
-        # A search keeps them once more.
+        # The search holds a copy of the axes.
         check_size(
             f"points: the coordinates of a lattice of {self.shape} points",
             2 * 8 * sum(self.shape),
@@ -73,16 +75,41 @@ class Lattice(Points):
         return th.stack(columns[::-1], dim=1)
 
 
-class Scattered(Points):
+class Scattered(Points, nn.Module):
     """
-    Points at given places.
+    Points at given places, which can be added to. The places are part of the state dict. A state without them, of a
+    version that did not save them, leaves the places as they are.
 
     :param places: shape (n_points, obs_dim), observation units
     """
 
+    places: th.Tensor
+
     def __init__(self, places: np.ndarray) -> None:
-        self.places = th.from_numpy(np.array(places, dtype=np.float64))
+        super().__init__()
+        self.register_buffer("places", th.from_numpy(np.array(places, dtype=np.float64)))
         self.n_points, self.obs_dim = self.places.shape
+
+    def append(self, new_points: Any) -> th.Tensor:
+        """
+        :param new_points: places of the points to add, shape (n, obs_dim), observation units, finite
+        :return: the indices of the new points, shape (n,), int64
+        :raises ValueError: if the places have another shape, or are not finite numbers
+        """
+        first = self.n_points
+        self._set(th.cat((self.places, th.from_numpy(check_places(new_points, self.obs_dim)).to(self.places))))
+        return th.arange(first, self.n_points, device=self.places.device)
+
+    def _set(self, places: th.Tensor) -> None:
+        self.places, self.n_points = places, len(places)
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        name = prefix + "places"
+        if name in state_dict:
+            # The number of points can differ from that at construction.
+            places = checked_tensor(state_dict, name, (None, self.obs_dim), th.float64)
+            self._set(places.to(self.places, copy=True))
+        super()._load_from_state_dict({**state_dict, name: self.places}, prefix, *args)
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
         places = self.places.to(bounds.low.device)
@@ -91,10 +118,10 @@ class Scattered(Points):
 
 def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
     """
-    :param points: ``"auto"``, an int (points in every dimension), one int a dimension, or an array of
-        shape (n_points, obs_dim) in observation units
+    :param points: ``"auto"``, an int (points in each dimension), one int per dimension, or an array of shape
+        (n_points, obs_dim) in observation units
     :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
-    :return: the points; for all but a Box one a state
+    :return: the points; one per state unless the space is a Box
     :raises ValueError: if ``points`` does not fit the space
     """
     if isinstance(observation_space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
@@ -129,24 +156,35 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
                 f"{shown(points)} (scattered points are an array of shape (n_points, {obs_dim}))"
             )
         return Lattice([check_integer("points", count, 1) for count in array.tolist()])
-    if array.ndim != 2 or array.shape[1] != obs_dim or len(array) == 0:
+    return Scattered(check_places(array, obs_dim))
+
+
+def check_places(points: Any, obs_dim: int) -> np.ndarray:
+    """
+    :param points: places of scattered points
+    :param obs_dim: number of observation dimensions
+    :return: the places, shape (n_points, obs_dim), float64
+    :raises ValueError: if ``points`` has another shape, is empty, or holds anything but finite numbers
+    """
+    places = check_numbers("points: finite places", points)
+    if places.ndim != 2 or places.shape[1] != obs_dim or len(places) == 0:
         raise ValueError(
-            f"points: scattered points must be an array of shape (n_points, {obs_dim}); got shape {array.shape}"
+            f"points: scattered points must be an array of shape (n_points, {obs_dim}); got shape {places.shape}"
         )
-    places = check_numbers("points: finite places", array)
     if not np.isfinite(places).all():
         raise ValueError(f"points: scattered points must be finite numbers; got {shown(points)}")
-    return Scattered(places)
+    return places
 
 
 def count_neighbors(n_neighbors: Any, observation_space: spaces.Space[Any], n_points: int, obs_dim: int) -> int:
     """
-    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for finite states
+    :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis, for a Box, and 1
+        otherwise
     :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param n_points: number of points to choose from
     :param obs_dim: number of observation dimensions
     :return: k
-    :raises ValueError: if it is no integer >= 1, or there are not so many points
+    :raises ValueError: if it is not an integer >= 1, or more than the number of points
     """
     exact = not isinstance(observation_space, spaces.Box)
     if isinstance(n_neighbors, str):

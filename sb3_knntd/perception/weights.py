@@ -1,4 +1,4 @@
-"""How much each neighbour counts, by its distance."""
+"""Weights of the neighbours by distance."""
 
 from __future__ import annotations
 
@@ -10,23 +10,35 @@ import torch as th
 
 from sb3_knntd.common.checks import LEAST, check_number, check_word, shown
 from sb3_knntd.common.tracing import is_traced
-from sb3_knntd.kernels.perceive import GAUSSIAN, INVERSE_QUADRATIC
+from sb3_knntd.kernels.perceive import Weighting
 
 
 class Weights(Protocol):
-    """From squared distances (batch, k), in scaled units and rising along k, to weights (batch, k)."""
+    """Maps squared distances (batch, k), in scaled units and ascending along k, to weights (batch, k)."""
 
     def __call__(self, squared_distances: th.Tensor, /) -> th.Tensor: ...
 
 
 class KernelWeights(ABC):
     """
-    Weights that the compiled step has in it.
+    Weights that the kernels know. Each subclass names its own ``WEIGHTING``, whose formula in
+    :func:`sb3_knntd.kernels.perceive.weigh` is the same.
 
     :param bandwidth: h, scaled units
     """
 
-    KERNEL: ClassVar[int]
+    WEIGHTING: ClassVar[Weighting]
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        # Inherited, it would have the kernels compute the formula of the parent class.
+        weighting = vars(cls).get("WEIGHTING")
+        if not isinstance(weighting, Weighting):
+            members = ", ".join(f"Weighting.{member.name}" for member in Weighting)
+            raise TypeError(
+                f"{cls.__name__}.WEIGHTING must be set in the class itself, to one of {members}; got "
+                f"{shown(weighting)}. Weights that the kernels do not know can be passed as a function"
+            )
 
     def __init__(self, bandwidth: float = 1.0) -> None:
         self.bandwidth = float(bandwidth)
@@ -42,7 +54,7 @@ class InverseQuadratic(KernelWeights):
     :param bandwidth: h, scaled units
     """
 
-    KERNEL = INVERSE_QUADRATIC
+    WEIGHTING = Weighting.INVERSE_QUADRATIC
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
         return 1.0 / (1.0 + squared_distances / (self.bandwidth * self.bandwidth))
@@ -50,13 +62,13 @@ class InverseQuadratic(KernelWeights):
 
 class Gaussian(KernelWeights):
     """
-    w = exp(-d² / 2h²), times a constant of each row that the normalisation takes out again: the nearest
-    neighbour has weight 1, so that an observation far outside the points still has a perception.
+    w = exp(-d² / 2h²), scaled in each row to give the nearest neighbour weight 1: far outside the points all weights
+    would be 0 otherwise. The normalisation cancels the scale.
 
     :param bandwidth: h, scaled units
     """
 
-    KERNEL = GAUSSIAN
+    WEIGHTING = Weighting.GAUSSIAN
 
     def __call__(self, squared_distances: th.Tensor) -> th.Tensor:
         excess = squared_distances - squared_distances[:, :1]
@@ -65,7 +77,7 @@ class Gaussian(KernelWeights):
 
 class Custom:
     """
-    A user's function, whose every answer is checked.
+    A user's function. Each return value is checked.
 
     :param function: from squared distances (batch, k) to weights (batch, k)
     """
@@ -102,7 +114,7 @@ class Custom:
 
     @staticmethod
     def _recorded(answer: Any) -> th.Tensor:
-        """What values there will be is not known while torch records how to compute them."""
+        """While torch traces there are no values to check."""
         if not isinstance(answer, th.Tensor):
             raise ValueError(
                 "a policy can be traced or exported if its weights are named ('inverse_quadratic', 'gaussian') or a "
@@ -111,26 +123,29 @@ class Custom:
         return answer.double()
 
 
-_BUILT_IN: dict[str, type[KernelWeights]] = {"inverse_quadratic": InverseQuadratic, "gaussian": Gaussian}
+#: The words that users pass are the names of the members in lower case.
+_BUILT_IN: dict[str, type[KernelWeights]] = {
+    weights.WEIGHTING.name.lower(): weights for weights in (InverseQuadratic, Gaussian)
+}
 
 
 def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
     """
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k)
         in scaled units to weights (batch, k)
-    :param bandwidth: h, scaled units; has no meaning for a function
-    :param n_neighbors: k, for the trial of a function
+    :param bandwidth: h, scaled units; not used by a function
+    :param n_neighbors: k, to try the function with
     :return: the weights
     :raises ValueError: if the word is unknown, h is less than 1e-100, or the function raises, or returns NaN, infinity,
-        negative or all-zero weights for distances as they occur
+        negative or all-zero weights for typical distances
     """
     bandwidth = check_number("bandwidth", bandwidth, LEAST)
     if not callable(weights):
         check_word("weights", weights, _BUILT_IN)
         return _BUILT_IN[weights](bandwidth)
     custom = Custom(weights)
-    # From an observation on top of a point to one at the far corner of a four-dimensional box; more rows than
-    # neighbours, so that a function that mixes up the two axes is found out.
+    # From an observation on a point to one at the far corner of a four-dimensional box. There are more rows than
+    # neighbours, so that a function that confuses the axes returns a wrong shape.
     reach = th.linspace(0.0, 1.0, n_neighbors, dtype=th.float64)
     scales, offsets = th.linspace(0.0, 4.0, n_neighbors + 2), th.linspace(0.0, 12.0, n_neighbors + 2)
     custom(scales[:, None].double() * reach + offsets[:, None].double())

@@ -1,11 +1,11 @@
-"""How the k nearest points are found: one file a search, all with the same answer."""
+"""Searches for the k nearest points. All exact ones return the same."""
 
 from __future__ import annotations
 
 from sb3_knntd.common.checks import check_size, check_word
 from sb3_knntd.kernels import jit
 from sb3_knntd.perception.points import Lattice, Points
-from sb3_knntd.perception.search.base import Neighbors, Search
+from sb3_knntd.perception.search.base import Neighbors, Search, SearchArguments
 from sb3_knntd.perception.search.brute import BruteSearch
 from sb3_knntd.perception.search.hnsw import HNSWSearch
 from sb3_knntd.perception.search.kd_tree import KDTreeSearch
@@ -19,17 +19,18 @@ __all__ = [
     "LatticeSearch",
     "Neighbors",
     "Search",
+    "SearchArguments",
     "make_search",
 ]
 
-#: Every search by its name.
+#: The searches by name.
 SEARCHES: dict[str, type[Search]] = {
     "brute": BruteSearch,
     "lattice": LatticeSearch,
     "kd_tree": KDTreeSearch,
     "hnsw": HNSWSearch,
 }
-#: So many scattered points are searched through sooner than SciPy is called.
+#: Up to this many scattered points, computing all distances is faster than a call of SciPy's tree.
 FEW_POINTS = 10_000
 
 
@@ -45,7 +46,7 @@ def make_search(search: str, points: Points, n_neighbors: int) -> Search:
     check_word("search", search, ["auto", *SEARCHES])
     kind = SEARCHES[choose_search(points) if search == "auto" else search]
     if isinstance(points, Lattice) and kind is not LatticeSearch:
-        # Each point has its place, once while they are put together and once in the order that the search needs.
+        # All coordinates are held twice while they are brought into the order that the search needs.
         check_size(
             f"search={search!r}: a list of {points.n_points} points",
             3 * 8 * points.n_points * points.obs_dim,
@@ -57,7 +58,7 @@ def make_search(search: str, points: Points, n_neighbors: int) -> Search:
 def choose_search(points: Points) -> str:
     """
     :param points: the points to search
-    :return: name of the exact search that is fastest for them
+    :return: name of the fastest exact search for them
     """
     if isinstance(points, Lattice) and (jit.AVAILABLE or points.n_points > FEW_POINTS):
         return "lattice"

@@ -1,15 +1,15 @@
-"""What every neighbour search does."""
+"""The interface of neighbour searches."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
 
 from sb3_knntd.kernels.nearest import order_candidates
-from sb3_knntd.kernels.perceive import FOUND
+from sb3_knntd.kernels.perceive import SearchKind
 from sb3_knntd.perception.bounds import Bounds
 from sb3_knntd.perception.points import Points
 
@@ -26,10 +26,26 @@ class Neighbors(NamedTuple):
     squared_distances: th.Tensor
 
 
+class SearchArguments(NamedTuple):
+    """
+    The part of :class:`~sb3_knntd.kernels.perceive.PerceptionArguments` that a search provides.
+
+    :param search: a :class:`~sb3_knntd.kernels.perceive.SearchKind`
+    :param axes: of a lattice, see :func:`~sb3_knntd.kernels.nearest.nearest_on_lattice`
+    :param offsets: of a lattice, likewise
+    :param columns: coordinates of the points, see :func:`~sb3_knntd.kernels.nearest.nearest_of_all`
+    """
+
+    search: int
+    axes: np.ndarray = np.empty(0)
+    offsets: np.ndarray = np.empty(0, np.int64)
+    columns: np.ndarray = np.empty((0, 0))
+
+
 class Search(ABC):
     """
-    Exact k-nearest-neighbour search in scaled units. Squared distances are summed over the dimensions in
-    their order, and ties go to the lower index, so that every search gives the same answer.
+    Exact k-nearest-neighbour search in scaled units. Squared distances are summed in the order of the dimensions, and
+    ties go to the lower index, so that all exact searches return the same.
 
     :param points: the points
     :param n_neighbors: k
@@ -43,7 +59,7 @@ class Search(ABC):
     @abstractmethod
     def fit(self, bounds: Bounds) -> None:
         """
-        Take in the places of the points; called again whenever the bounds have moved.
+        Read the coordinates of the points. Called again whenever the bounds or the points have changed.
 
         :param bounds: the range that is mapped to [-1, 1]
         """
@@ -55,17 +71,16 @@ class Search(ABC):
         :return: their neighbours
         """
 
-    def kernel_arguments(self) -> tuple[Any, ...]:
+    def kernel_arguments(self) -> SearchArguments:
         """
-        :return: search, axes, offsets and columns of ``eyes`` of :func:`sb3_knntd.kernels.perceive.perceive`; by
-            default it is told that neighbours are found before it is called
+        :return: what the kernels need to search; by default, that the neighbours are found before they are called
         """
-        return FOUND, np.empty(0), np.empty(0, np.int64), np.empty((0, 0))
+        return SearchArguments(int(SearchKind.OUTSIDE))
 
 
 def nearest_by_tensors(scaled: th.Tensor, places: th.Tensor, k: int) -> Neighbors:
     """
-    The answer of every exact search by torch's most common operations, which can be traced and exported.
+    Exact search with torch operations that can be traced and exported.
 
     :param scaled: observations in scaled units, shape (batch, obs_dim)
     :param places: the points, shape (n_points, obs_dim), scaled units
@@ -77,7 +92,7 @@ def nearest_by_tensors(scaled: th.Tensor, places: th.Tensor, k: int) -> Neighbor
         distances = distances + (scaled[:, dimension, None] - places[:, dimension]).square()
     indices, nearest = [], []
     for _ in range(k):
-        # The first of several equals.
+        # argmin returns the first of several minima.
         index = distances.argmin(dim=1, keepdim=True)
         indices.append(index)
         nearest.append(distances.gather(1, index))
@@ -89,7 +104,7 @@ def nearest_of_candidates(queries: np.ndarray, places: np.ndarray, candidates: n
     """
     :param queries: shape (batch, obs_dim), scaled units
     :param places: the points, shape (n_points, obs_dim), scaled units
-    :param candidates: at least k of them for each query, shape (batch, n), int64
+    :param candidates: points, at least k for each query, shape (batch, n), int64
     :param k: number of neighbours
     :return: the first k by (squared distance, index)
     """

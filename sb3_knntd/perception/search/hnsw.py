@@ -1,4 +1,4 @@
-"""Approximate search in a navigable small-world graph: very many points in many dimensions."""
+"""Approximate search in a navigable small-world graph, for very many points in many dimensions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sb3_knntd.perception.search.base import Neighbors, Search, nearest_of_candi
 if TYPE_CHECKING:
     import voyager
 
-#: Links of a point, and candidates kept while the graph is built: Voyager's defaults.
+#: Number of links of a point, and of candidates while the graph is built: Voyager's defaults.
 LINKS = 12
 BUILD_CANDIDATES = 200
 
@@ -22,10 +22,12 @@ BUILD_CANDIDATES = 200
 class HNSWSearch(Search):
     """
     Voyager's graph (Malkov and Yashunin, Efficient and robust approximate nearest neighbor search using
-    hierarchical navigable small world graphs, 2018) proposes k neighbours out of max(48, 3 k) candidates, in single
-    precision; their distances are computed anew and ordered as in every search. It may miss some: with 10⁵ points in
-    6 dimensions and k = 16 it finds over 99 % of the true neighbours. The graph is built by one thread, so that it is
-    the same every time; that takes 10 to 20 s for 10⁵ points.
+    hierarchical navigable small world graphs, 2018) proposes k neighbours out of max(48, 3 k) candidates in single
+    precision. Their distances are computed again, and ordered as in all searches. It may miss some: with 10⁵ points in
+    6 dimensions and k = 16 it finds over 99 % of the true neighbours. One thread builds the graph, so that it is
+    reproducible. For 10⁵ points that takes 10 to 20 s.
+
+    :raises ImportError: if Voyager is not installed
     """
 
     _places: np.ndarray

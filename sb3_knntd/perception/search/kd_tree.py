@@ -1,4 +1,4 @@
-"""Search with SciPy's kd-tree: scattered points in few dimensions."""
+"""Exact search with SciPy's kd-tree, for scattered points in few dimensions."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from scipy.spatial import cKDTree
 from sb3_knntd.perception.bounds import Bounds
 from sb3_knntd.perception.search.base import Neighbors, Search, nearest_of_candidates
 
-#: The tree measures distances by its own arithmetic; two nearer to each other than this share may be in either order.
+#: The tree computes distances in another order of operations. It may swap two that differ by less than this fraction.
 ROUNDING = 1e-9
 
 
 class KDTreeSearch(Search):
     """
-    The tree proposes one neighbour more than is asked for. Its distances are computed anew in the order that
-    all searches share; where the last two are too near to each other to tell, all points as near are taken in.
+    The tree proposes k + 1 neighbours, whose distances are computed again in the order of operations that all searches
+    share. Where the last two distances are equal up to rounding, all points at that distance become candidates.
     """
 
     _places: np.ndarray
@@ -30,7 +30,7 @@ class KDTreeSearch(Search):
         queries, k = scaled.cpu().numpy(), self.n_neighbors
         n_proposed = min(k + 1, self.points.n_points)
         distances, proposed = map(np.asarray, self._tree.query(queries, k=n_proposed))
-        # SciPy drops the axis of a single neighbour, and hands out int32 on some systems.
+        # SciPy drops the axis of a single neighbour, and returns int32 on some systems.
         distances = distances.reshape(len(queries), n_proposed)
         candidates = proposed.reshape(len(queries), n_proposed).astype(np.int64, copy=False)
         found = nearest_of_candidates(queries, self._places, candidates, k)
