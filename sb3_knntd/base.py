@@ -30,6 +30,7 @@ from sb3_knntd.actions.selection import ActionRule
 from sb3_knntd.common.callback_dispatcher import Audience
 from sb3_knntd.common.checks import (
     PROGRESS,
+    check_finite,
     check_flag,
     check_integer,
     check_number,
@@ -41,9 +42,9 @@ from sb3_knntd.common.checks import (
 from sb3_knntd.common.files import read_description, replacing
 from sb3_knntd.common.plain import encodable, objects_for
 from sb3_knntd.common.random_stream import RandomStream
-from sb3_knntd.common.schedules import check_rate, make_schedule
+from sb3_knntd.common.schedules import check_rate, make_schedule, progress_remaining
 from sb3_knntd.kernels.step import UNDRAWN
-from sb3_knntd.learners.base import Form, Learner, Rates, TorchLearner, check_finite, check_transition
+from sb3_knntd.learners.base import Form, Learner, Rates, TorchLearner, check_transition
 from sb3_knntd.learners.compiled import CompiledLearner
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
@@ -771,12 +772,3 @@ def check_device(device: Any) -> th.device:
         else:
             return found
     raise ValueError(f"device must be 'cpu', 'cuda', 'auto' or another of torch's; got {shown(device)}") from error
-
-
-def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
-    """
-    :param num_timesteps: steps so far; the last of several environments can go beyond the total
-    :param total_timesteps: steps in all
-    :return: the share that remains, from 1 to 0
-    """
-    return 1.0 - num_timesteps / total_timesteps if num_timesteps < total_timesteps else 0.0

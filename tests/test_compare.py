@@ -25,9 +25,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-import sb3_knntd.cli
 from sb3_knntd import KNNTD
 from sb3_knntd.cli import main
+from sb3_knntd.common import command_line
 from sb3_knntd.distributed.jobs import Job, Outcome, run_jobs, run_locally
 from sb3_knntd.experiments.compare import statistics
 from sb3_knntd.experiments.compare.cautions import cautions
@@ -326,8 +326,8 @@ def test_a_configuration_that_cannot_be_built_is_told_of_at_once(
 
 
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    found = sb3_knntd.cli.find_spec
-    monkeypatch.setattr(sb3_knntd.cli, "find_spec", lambda name: None if name in ("rliable", "ray") else found(name))
+    found = command_line.find_spec
+    monkeypatch.setattr(command_line, "find_spec", lambda name: None if name in ("rliable", "ray") else found(name))
     with pytest.raises(SystemExit, match="2"):
         main(["compare", "--env", "CartPole-v1", "--algos", "knntd"])
     assert 'rliable not installed: pip install "sb3-knntd[compare]"' in capsys.readouterr().err

@@ -58,3 +58,12 @@ def make_schedule(value: float | Schedule | str) -> FloatSchedule:
     :return: the schedule
     """
     return FloatSchedule(parse_schedule("schedule", value) if isinstance(value, str) else value)
+
+
+def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
+    """
+    :param num_timesteps: steps so far; the last of several environments can go beyond the total
+    :param total_timesteps: steps in all
+    :return: the share that remains, from 1 to 0
+    """
+    return 1.0 - num_timesteps / total_timesteps if num_timesteps < total_timesteps else 0.0

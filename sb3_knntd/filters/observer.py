@@ -7,10 +7,10 @@ import warnings
 import numpy as np
 import torch as th
 
+from sb3_knntd.common.checks import check_finite
 from sb3_knntd.filters.table import DeltaTable
 from sb3_knntd.kernels import filter as kernel
 from sb3_knntd.kernels import jit
-from sb3_knntd.learners.base import check_finite
 
 
 class Observer:

@@ -10,7 +10,6 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.actions.columns import make_action_columns
-from sb3_knntd.base import progress_remaining
 from sb3_knntd.common.checks import (
     check_flag,
     check_integer,
@@ -21,6 +20,7 @@ from sb3_knntd.common.checks import (
     check_word,
     shown,
 )
+from sb3_knntd.common.schedules import progress_remaining
 from sb3_knntd.common.state_checks import checked_integer, checked_points, checked_tensor
 from sb3_knntd.kernels.filter import ADAPTIVE, COUNT, FIXED, OF_UPDATE
 from sb3_knntd.perception import Perceiver, make_bounds, make_points, make_weights

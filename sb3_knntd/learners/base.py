@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 
 from sb3_knntd.actions.selection import ActionRule, Choice
+from sb3_knntd.common.checks import check_finite
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.state_checks import checked_integer, checked_points, checked_tensor, entry
 from sb3_knntd.kernels.memory import LEAST_CLOCK
@@ -159,20 +160,6 @@ class Learner(ABC):
         # A store has grown to no more than this, see LiveStore.reserve.
         most = 4 * (n_points if rows is None else len(rows)) + 2 * n_envs * k
         checked_integer(traces, "capacity", n, max(most, LiveStore.SMALLEST))
-
-
-def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
-    """
-    :param what: what the values are
-    :param values: a row for each of ``envs``
-    :param envs: the environments that returned them
-    :raises ValueError: if a value is not finite; the message says where
-    """
-    finite = np.isfinite(values)
-    if not finite.all():
-        row, *component = np.argwhere(~finite)[0].tolist()
-        where = f" in component {component[0]}" if component else ""
-        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
 
 
 def check_transition(observations: np.ndarray, rewards: np.ndarray) -> None:

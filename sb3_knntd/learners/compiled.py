@@ -9,11 +9,12 @@ import numpy as np
 import torch as th
 
 from sb3_knntd.actions.selection import ActionRule
+from sb3_knntd.common.checks import check_finite
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.kernels import step as kernel
 from sb3_knntd.kernels.desk import set_desk
 from sb3_knntd.kernels.step import FINE, FULL, USED_UP
-from sb3_knntd.learners.base import DIVERGENCE, Form, Learner, Rates, check_finite, check_transition
+from sb3_knntd.learners.base import DIVERGENCE, Form, Learner, Rates, check_transition
 from sb3_knntd.perception import Perceiver
 from sb3_knntd.q_table import LiveStore, QTable
 
