@@ -36,7 +36,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 from benchmarks.machine import describe
 from sb3_knntd import VecDeltaFilter
 from sb3_knntd.common.files import replace_file
-from sb3_knntd.distributed.jobs import Job, run_jobs
+from sb3_knntd.distributed.jobs import Job, run_jobs, stored_as
 from sb3_knntd.registry import Role, with_role
 from sb3_knntd.zoo import register
 from sb3_knntd.zoo.experiment import KNNExperimentManager
@@ -127,6 +127,8 @@ def configurations() -> dict[tuple[str, str], dict[str, Any]]:
     }
 
 
+# Run by ``python -m`` it was stored under the other name.
+@stored_as("benchmarks.zoo.play", "__main__.play")
 def play(algo: str, env_id: str, settings: Mapping[str, Any], seed: int, episodes: int) -> dict[str, Any]:
     """
     :param algo: algorithm

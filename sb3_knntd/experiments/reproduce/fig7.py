@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_knntd.distributed.jobs import stored_as
 from sb3_knntd.envs import CartPoleEnv
 from sb3_knntd.experiments.reproduce.figure import PaperFigure, Results, Table
 from sb3_knntd.experiments.reproduce.settings import Setting, make_model, total_steps
@@ -61,6 +62,7 @@ class FullEpisodeRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         return observation, reward, terminated, truncated, info
 
 
+@stored_as("sb3_knntd.reproduce.fig7.first_full_episode")
 def first_full_episode(algorithm: str, setting: Setting, seed: int) -> dict[str, Any]:
     """
     Learn until an episode lasts as long as it may, or for as many episodes as the setting says.
