@@ -669,12 +669,3 @@ def check_device(device: Any) -> th.device:
         else:
             return found
     raise ValueError(f"device must be 'cpu', 'cuda', 'auto' or another of torch's; got {shown(device)}") from error
-
-
-def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
-    """
-    :param num_timesteps: steps so far; the last of several environments can go beyond the total
-    :param total_timesteps: steps in all
-    :return: the share that remains, from 1 to 0
-    """
-    return 1.0 - num_timesteps / total_timesteps if num_timesteps < total_timesteps else 0.0

@@ -142,6 +142,20 @@ def check_numbers(name: str, value: Any) -> np.ndarray:
     return array.astype(np.float64)
 
 
+def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
+    """
+    :param what: what the values are
+    :param values: a row for each of ``envs``
+    :param envs: the environments that returned them
+    :raises ValueError: if a value is not finite; the message says where
+    """
+    finite = np.isfinite(values)
+    if not finite.all():
+        row, *component = np.argwhere(~finite)[0].tolist()
+        where = f" in component {component[0]}" if component else ""
+        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
+
+
 def check_schedule(
     name: str, value: float | Callable[[float], float], low: float, high: float = math.inf, *, above: bool = False
 ) -> float | Callable[[float], float]:
@@ -169,20 +183,6 @@ def check_schedule(
             ) from error
         check_number(at, number, low, high, above=above)
     return value
-
-
-def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
-    """
-    :param what: what the values are
-    :param values: one row for each of ``envs``
-    :param envs: the environments that returned them
-    :raises ValueError: if a value is not finite; the message says where
-    """
-    finite = np.isfinite(values)
-    if not finite.all():
-        row, *component = np.argwhere(~finite)[0].tolist()
-        where = f" in component {component[0]}" if component else ""
-        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
 
 
 def check_path(name: str, value: Any) -> Path:

@@ -10,7 +10,8 @@ import torch as th
 
 from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.random_stream import RandomStream
-from sb3_knntd.common.transitions import check_finite, check_transition
+from sb3_knntd.common.checks import check_finite
+from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels import td
 from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination, SelectionArguments
 from sb3_knntd.kernels.state import EpisodeArrays, RandomRows, UpdateConfig, WorkArrays, make_state

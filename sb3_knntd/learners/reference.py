@@ -10,7 +10,8 @@ import torch as th
 
 from sb3_knntd.actions.selection import ActionSelector, Selection
 from sb3_knntd.common.random_stream import RandomStream
-from sb3_knntd.common.transitions import check_finite, check_transition
+from sb3_knntd.common.checks import check_finite
+from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels.selection import UNDRAWN, count_steps
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE
