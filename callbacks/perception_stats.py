@@ -1,4 +1,4 @@
-"""What the table sees and how it changes, as numbers."""
+"""Statistics of the perception and of the changes of the table."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 
 from sb3_knntd.common.checks import check_integer
-from sb3_knntd.kernels.step import UNDRAWN
+from sb3_knntd.kernels.selection import UNDRAWN
 
-from .paced import PacedCallback
+from .throttled import ThrottledCallback
 
-#: Calls between two of which the transition is kept. A prime, lest it beat with the length of the episodes.
+#: Every so many calls a transition is sampled. A prime, so that it is no multiple of the length of the episodes.
 STRIDE = 101
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}
 
@@ -37,7 +36,7 @@ class Transitions(NamedTuple):
     terminated: np.ndarray
 
 
-class PerceptionStatsCallback(PacedCallback):
+class PerceptionStatsCallback(ThrottledCallback):
     """
     Logs how observations are seen and what learning does, from a sample of the transitions (one call in 102) and at
     training's end:
@@ -133,24 +132,22 @@ class PerceptionStatsCallback(PacedCallback):
         return float(((places < low) | (places > high)).any(axis=1).mean())
 
     def _td_errors(self, sample: Transitions) -> np.ndarray:
-        """r + γ times what the next state is worth as a target, less Q(s, a); by the table as it is."""
+        """r + γ times the value of the next state as a target, minus Q(s, a), by the table as it is."""
         model = self.model
-        policy, rule = model.policy, model._rule
+        policy = model.policy
+        selector = policy.selector
         with th.no_grad():
             rows, probabilities = policy.perceived_rows(sample.observations)
-            if isinstance(model.action_space, spaces.Discrete):
-                columns = th.from_numpy(sample.actions - model.action_space.start).to(rows.device)
-                entries = columns[:, None, None].expand(*rows.shape[:2], 1)
-            else:
-                # What ExA's states are worth hangs on no entry (eq. 25).
-                entries = th.empty(0, dtype=th.int64, device=rows.device)
-            now = rule.value(rows, probabilities, entries)
+            columns = th.from_numpy(policy.columns_of(sample.actions)).to(rows.device)
+            values = selector.value(rows, probabilities, columns[:, None].expand(*rows.shape[:2], -1))
             rows, probabilities = policy.perceived_rows(sample.next_observations)
-            uniforms = th.from_numpy(self._generator.random((len(rows), rule.n_uniforms))).to(rows.device)
-            held = th.full((len(rows), len(rule.blocks) - 1), UNDRAWN, device=rows.device)
-            then = rule.choose(rows, probabilities, uniforms, model.exploration_rate, held).values
-        worth = np.where(sample.terminated, 0.0, then.double().cpu().numpy())
-        errors: np.ndarray = sample.rewards + model.gamma * worth - now.double().cpu().numpy()
+            uniforms = th.from_numpy(self._generator.random((len(rows), selector.n_uniforms))).to(rows.device)
+            nothing = th.full((len(rows), selector.n_factors), UNDRAWN, device=rows.device)
+            target_values = selector.select(
+                rows, probabilities, uniforms, model.exploration_rate, nothing
+            ).target_values
+        targets = np.where(sample.terminated, 0.0, target_values.double().cpu().numpy())
+        errors: np.ndarray = sample.rewards + model.gamma * targets - values.double().cpu().numpy()
         return errors
 
 

@@ -325,7 +325,7 @@ class KNNAlgorithm(OnlineAlgorithm):
         self.lr_schedule = make_schedule(self.learning_rate)
 
     def _check_parameters(self) -> None:
-        self.learning_rate = check_rate("learning_rate", self.learning_rate, 0.0)  # type: ignore[assignment]
+        self.learning_rate = check_rate("learning_rate", self.learning_rate, 0.0)
         self.gamma = check_number("gamma", self.gamma, 0.0, 1.0)
         self.trace_decay = check_rate("trace_decay", self.trace_decay, 0.0, 1.0)
         check_word("step_size", self.step_size, ["paper", "normalized"])

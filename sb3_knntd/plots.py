@@ -534,12 +534,10 @@ def _read_batch(model: KNNAlgorithm, observations: np.ndarray) -> _Reading:
     with th.no_grad():
         rows, probabilities = policy.perceived_rows(observations)
         q_values = mean_rows(rows, probabilities)
-        if isinstance(model.action_space, spaces.Discrete):
-            values, actions = q_values.amax(dim=1), q_values.argmax(dim=1).cpu().numpy()
-        else:
-            # The mean of the best values (eq. 25), whichever columns were answered for.
-            values = model._rule.value(rows, probabilities, th.empty(0, dtype=th.int64))
-            actions = policy.predict(observations)[0].reshape(len(observations), -1)
+        selector = policy.selector
+        values = selector.greedy_value(rows, probabilities)
+        selected = selector.greedy_indices(rows, probabilities)
+        actions = selector.actions_of(selected, probabilities).cpu().numpy()
         learned = (rows != model.initial_value).flatten(1).any(dim=1)
     return _Reading(q_values.cpu().numpy(), values.cpu().numpy(), actions, learned.cpu().numpy())
 

@@ -279,6 +279,15 @@ class KNNPolicy(BasePolicy):
             fitting += self._first_action
         return fitting
 
+    def columns_of(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: actions of the environment, shape (batch, *action_shape)
+        :return: the columns of the table that stand for them, or come closest, one for each action factor, shape
+            (batch, n_factors), int64
+        :raises ValueError: if there is no such action
+        """
+        return self.selector.columns_of(np.asarray(actions) - self._first_action)
+
     def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         """Actions of the environment, (batch, *action_shape), from the columns that the neighbours select."""
         return self.fit_actions(action_indices[:, 0, 0])
@@ -431,6 +440,15 @@ class ExAPolicy(KNNPolicy):
             np.maximum(fitting, self.action_space.low, out=fitting)
             np.minimum(fitting, self.action_space.high, out=fitting)
         return fitting
+
+    def columns_of(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: actions of the environment, shape (batch, *action_shape)
+        :return: the columns of the table that come closest to them, one for each action factor, shape (batch,
+            n_factors), int64
+        :raises ValueError: if an action is not finite, or has another shape
+        """
+        return self.selector.columns_of(np.asarray(actions).reshape(len(actions), -1))
 
     def _greedy_selector(self) -> ActionSelector:
         return MeanActionSelector(self.columns, Exploration.SHARED, 1.0, 0.0, self.n_neighbors, random_ties=False)

@@ -16,12 +16,12 @@ import rl_zoo3
 import yaml
 from gymnasium import spaces
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from sb3_knntd.experiments.baselines.stepwise import StepwiseAlgorithm
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_knntd
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.cli import main
-from sb3_knntd.experiments.baselines.stepwise import StepwiseAlgorithm
 from sb3_knntd.experiments.compare.command import Plan, choose_configurations
 from sb3_knntd.experiments.compare.configurations import configuration, fits, is_own, label
 from sb3_knntd.experiments.compare.experiment import prepare

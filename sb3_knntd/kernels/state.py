@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -222,9 +222,10 @@ def _make_state(fields):
     return KernelState(*borrow(fields))
 
 
-def make_state(*groups: tuple) -> KernelState:
+def make_state(*groups: tuple[Any, ...]) -> KernelState:
     """
     :param groups: a value of each of ``GROUPS``, in their order. Whoever has the state keeps their arrays
     :return: all their fields as one object
     """
-    return _make_state(tuple(chain.from_iterable(groups)))
+    state: KernelState = _make_state(tuple(chain.from_iterable(groups)))
+    return state

@@ -9,8 +9,8 @@ import numpy as np
 import torch as th
 
 from sb3_knntd.actions.selection import ActionSelector
-from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.checks import check_finite
+from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels import td
 from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination, SelectionArguments
@@ -166,8 +166,10 @@ class CompiledLearner(Learner):
         episodes = self._workplace.episodes
         # One action for all neighbours is the column that the first of them selected.
         if self._workplace.selection.combination == Combination.OF_VALUES:
-            return episodes.action_indices[td.CURRENT, :, 0, 0]
-        return episodes.actions[td.CURRENT]
+            indices: np.ndarray = episodes.action_indices[td.CURRENT, :, 0, 0]
+            return indices
+        vectors: np.ndarray = episodes.actions[td.CURRENT]
+        return vectors
 
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
         super().configure(selector, config)

@@ -9,8 +9,8 @@ import numpy as np
 import torch as th
 
 from sb3_knntd.actions.selection import ActionSelector, Selection
-from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.checks import check_finite
+from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels.selection import UNDRAWN, count_steps
 from sb3_knntd.kernels.state import UpdateConfig

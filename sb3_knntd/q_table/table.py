@@ -301,13 +301,13 @@ class _Rows(NamedTuple):
     :param values: shape (capacity, n_actions)
     :param points: the point of each row, shape (capacity,), int64
     :param slots: hash of the rows by point
-    :param count: number of rows in use, shape (1,), int64
+    :param n_used: number of rows in use, shape (1,), int64
     """
 
     values: th.Tensor
     points: th.Tensor
     slots: np.ndarray
-    count: np.ndarray
+    n_used: np.ndarray
 
 
 class HashedTable(QTable):
@@ -351,7 +351,7 @@ class HashedTable(QTable):
 
     @property
     def n_visited(self) -> int:
-        return int(self._rows.count[0])
+        return int(self._rows.n_used[0])
 
     def entries(self) -> th.Tensor:
         with self.lock:
@@ -394,7 +394,7 @@ class HashedTable(QTable):
             visited=np.empty(0, np.uint8),
             row_points=rows.points.numpy(),
             row_slots=rows.slots,
-            n_rows=rows.count,
+            n_rows=rows.n_used,
             initial_value=self.initial_value,
         )
 
