@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from decimal import Decimal
 from pathlib import Path
 from enum import Enum
@@ -169,20 +169,6 @@ def check_schedule(
             ) from error
         check_number(at, number, low, high, above=above)
     return value
-
-
-def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
-    """
-    :param what: what the values are
-    :param values: one row for each of ``envs``
-    :param envs: the environments that returned them
-    :raises ValueError: if a value is not finite; the message says where
-    """
-    finite = np.isfinite(values)
-    if not finite.all():
-        row, *component = np.argwhere(~finite)[0].tolist()
-        where = f" in component {component[0]}" if component else ""
-        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
 
 
 def check_path(name: str, value: Any) -> Path:
