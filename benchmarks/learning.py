@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 from concurrent.futures import ProcessPoolExecutor
-from importlib.resources import files
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from benchmarks.machine import describe
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd.registry import ALGORITHMS
 from sb3_knntd.zoo.schedules import with_schedules
 
 EPISODES = 100
@@ -39,7 +38,7 @@ class Case(NamedTuple):
     :param target: what the median must reach; ``None`` if there is nothing to reach
     :param n_envs: environments in step
     :param tuned: whether the settings are those of ``zoo_configs/``
-    :param algorithm: ``"knntd"`` or ``"exa"``
+    :param algorithm: name of an algorithm of this package
     """
 
     what: str
@@ -51,7 +50,6 @@ class Case(NamedTuple):
     algorithm: str = "knntd"
 
 
-ALGORITHMS: dict[str, type[KNNTD] | type[ExA]] = {"knntd": KNNTD, "exa": ExA}
 TABLES = {
     "untuned": [
         Case("KNNTD(id)", "MountainCar-v0", 50_000, -130),
@@ -75,11 +73,13 @@ TABLES = {
 
 def tuned_settings(algorithm: str, env_id: str) -> dict[str, Any]:
     """
-    :param algorithm: ``"knntd"`` or ``"exa"``
+    :param algorithm: name of an algorithm of this package
     :param env_id: environment
     :return: its arguments in ``zoo_configs/``, schedules made into functions
     """
-    settings = yaml.safe_load(files("sb3_knntd.zoo_configs").joinpath(f"{algorithm}.yml").read_text())[env_id]
+    path = ALGORITHMS[algorithm].config_path
+    assert path is not None
+    settings = yaml.safe_load(path.read_text(encoding="utf-8"))[env_id]
     return with_schedules({name: value for name, value in settings.items() if name not in ("n_timesteps", "policy")})
 
 
@@ -92,7 +92,7 @@ def play(case: Case, seed: int) -> float:
     th.set_num_threads(1)
     settings = tuned_settings(case.algorithm, case.env_id) if case.tuned else {}
     venv = make_vec_env(case.env_id, case.n_envs, seed=seed)
-    model = ALGORITHMS[case.algorithm](venv, seed=seed, **settings)
+    model = ALGORITHMS[case.algorithm].load()(venv, seed=seed, **settings)
     model.learn(case.steps)
     evaluation = make_vec_env(case.env_id, 10, seed=10_000 + seed)
     mean, _ = evaluate_policy(model, evaluation, n_eval_episodes=EPISODES, deterministic=True)

@@ -39,7 +39,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from benchmarks.machine import describe
-from sb3_knntd import KNNTD, DeltaFilter, ExA, VecDeltaFilter
+from sb3_knntd import DeltaFilter, VecDeltaFilter
+from sb3_knntd.registry import ALGORITHMS, Role, with_role
 
 #: Standard deviation of the noise over a dimension's range.
 NOISE = 0.03
@@ -123,7 +124,7 @@ class Case(NamedTuple):
     :param names: of its observation's dimensions
     :param ranges: of its observation's dimensions, widths
     :param controller: a competent policy, of the true state
-    :param algorithm: what learns on it
+    :param algorithm: name of the algorithm that learns on it
     :param state: the environment's state that gives an observation
     :param observe: the observation that a state gives
     :param remark: what sets it apart from others with the same environment
@@ -133,7 +134,7 @@ class Case(NamedTuple):
     names: tuple[str, ...]
     ranges: tuple[float, ...]
     controller: Callable[[np.ndarray], Any]
-    algorithm: type[KNNTD] | type[ExA]
+    algorithm: str
     state: Callable[[np.ndarray], np.ndarray] = np.array
     observe: Callable[[Any], np.ndarray] = np.array
     remark: str = ""
@@ -145,14 +146,14 @@ class Case(NamedTuple):
 
 
 CASES = [
-    Case("MountainCar-v0", ("position", "velocity"), (1.8, 0.14), drive, KNNTD),
-    Case("CartPole-v1", ("position", "velocity", "angle", "angular velocity"), (9.6, 6, 0.8378, 6), balance, KNNTD),
+    Case("MountainCar-v0", ("position", "velocity"), (1.8, 0.14), drive, "knntd"),
+    Case("CartPole-v1", ("position", "velocity", "angle", "angular velocity"), (9.6, 6, 0.8378, 6), balance, "knntd"),
     Case(
         "Pendulum-v1",
         ("cosine", "sine", "angular velocity"),
         (2, 2, 16),
         swing_up,
-        ExA,
+        "exa",
         angle_of,
         cosine_of,
     ),
@@ -286,13 +287,23 @@ def make_noisy(case: Case, n_envs: int, seed: int, noise: bool) -> VecEnv:
     )
 
 
-def learned_return(case: Case, seed: int, noise: bool, filtered: bool, algorithm: str | None) -> float:
+def shown(algorithm: str) -> str:
+    """
+    :param algorithm: name of an algorithm, or of who acts in its place
+    :return: what tables call it: an algorithm of this package by its class
+    """
+    if algorithm in with_role(Role.OWN):
+        return ALGORITHMS[algorithm].load().__name__
+    return algorithm.upper() if algorithm == "dqn" else algorithm
+
+
+def learned_return(case: Case, seed: int, noise: bool, filtered: bool, algorithm: str) -> float:
     """
     :param case: environment
     :param seed: seed of everything
     :param noise: whether observations have noise, in training and evaluation
     :param filtered: whether they are filtered, in training and evaluation
-    :param algorithm: ``"KNNTD"``, ``"ExA"``, ``"DQN"`` or ``"random"``, with its defaults
+    :param algorithm: name of an algorithm of this package, ``"dqn"`` or ``"random"``, with its defaults
     :return: mean return of what was learned in ``LEARNING`` steps
     """
     th.set_num_threads(1)
@@ -303,9 +314,11 @@ def learned_return(case: Case, seed: int, noise: bool, filtered: bool, algorithm
     if algorithm == "random":
         evaluation.action_space.seed(seed)
         return _random_return(evaluation)
-    kinds: dict[str, Any] = {"KNNTD": KNNTD, "ExA": ExA, "DQN": lambda env, seed: DQN("MlpPolicy", env, seed=seed)}
-    assert algorithm is not None
-    model: BaseAlgorithm = kinds[algorithm](venv, seed=seed)
+    model: BaseAlgorithm
+    if algorithm == "dqn":
+        model = DQN("MlpPolicy", venv, seed=seed)
+    else:
+        model = ALGORITHMS[algorithm].load()(ALGORITHMS[algorithm].policy, venv, seed=seed)
     model.learn(LEARNING)
     mean, _ = evaluate_policy(model, evaluation, n_eval_episodes=EPISODES, deterministic=True)
     assert isinstance(mean, float)
@@ -398,7 +411,7 @@ def harmless_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
     rows = []
     n = len(seeds)
     for case in CASES:
-        algorithm = case.algorithm.__name__
+        algorithm = case.algorithm
         for who in ("controller", algorithm):
             figures = [
                 list(pool.map(controller_return, [case] * n, seeds, [filtered] * n))
@@ -406,7 +419,7 @@ def harmless_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
                 else list(pool.map(learned_return, [case] * n, seeds, [False] * n, [filtered] * n, [algorithm] * n))
                 for filtered in (False, True)
             ]
-            print(f"| {case.env_id} | {who} | {spread(figures[0])} | {spread(figures[1])} |", flush=True)
+            print(f"| {case.env_id} | {shown(who)} | {spread(figures[0])} | {spread(figures[1])} |", flush=True)
             rows.append({"environment": case.env_id, "who": who, "without": figures[0], "with": figures[1]})
     return rows
 
@@ -430,7 +443,7 @@ def learning_table(pool: ProcessPoolExecutor, seeds: range, algorithm: str) -> l
         low, high, *reached = (statistics.median(returns) for returns in figures)
         # Where nothing is learned without noise there is no way to go a share of.
         shares = [f"{(value - low) / (high - low):.0%}" if high > low else "" for value in reached]
-        print(f"| {' | '.join([case.env_id, algorithm, *map(spread, figures), *shares])} |", flush=True)
+        print(f"| {' | '.join([case.env_id, shown(algorithm), *map(spread, figures), *shares])} |", flush=True)
         rows.append({"environment": case.env_id, "algorithm": algorithm, "returns": figures})
     return rows
 
@@ -450,8 +463,8 @@ TABLES: dict[str, Callable[[ProcessPoolExecutor, range], list[Row]]] = {
     "rmse": rmse_table,
     "soon": soon_table,
     "harmless": harmless_table,
-    "learning": partial(learning_table, algorithm="KNNTD"),
-    "dqn": partial(learning_table, algorithm="DQN"),
+    "learning": partial(learning_table, algorithm="knntd"),
+    "dqn": partial(learning_table, algorithm="dqn"),
     "time": time_table,
 }
 

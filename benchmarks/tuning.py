@@ -21,10 +21,10 @@ import numpy as np
 import optuna
 import yaml
 
-from benchmarks.zoo import ALGORITHMS, EPISODES, configurations, jobs
+from benchmarks.zoo import EPISODES, configurations, jobs
 from sb3_knntd.distributed.jobs import Job, run_jobs
+from sb3_knntd.registry import ALGORITHMS, Role, with_role
 from sb3_knntd.zoo import register
-from sb3_knntd.zoo.search_space import CONVERTERS
 
 #: Name of the row of what ``zoo_configs/`` has.
 PRESENT = "present"
@@ -49,16 +49,16 @@ def candidates(algo: str, configuration: Mapping[str, Any], study: optuna.Study,
     """
     done = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
     done = sorted((trial for trial in done if math.isfinite(trial.values[0])), key=lambda trial: -trial.values[0])
+    convert = ALGORITHMS[algo].load_search_space().convert
     found = {
-        str(trial.number): {**configuration, **rounded(CONVERTERS[algo](rounded(trial.params, 2)), 4)}
-        for trial in done[:best]
+        str(trial.number): {**configuration, **rounded(convert(rounded(trial.params, 2)), 4)} for trial in done[:best]
     }
     return {PRESENT: dict(configuration), **found}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--algo", choices=ALGORITHMS, required=True)
+    parser.add_argument("--algo", choices=with_role(Role.OWN), required=True)
     parser.add_argument("--env", required=True, metavar="ID", help="an environment that has a configuration")
     parser.add_argument("--storage", required=True, help="as of the study: a .log file or a database")
     parser.add_argument("--study-name", required=True)

@@ -4,10 +4,10 @@ The configurations of ``zoo_configs/`` beside RL Zoo's published figures.
     python -m benchmarks.zoo [--env ID ...] [--seeds N [ID=N ...]] [--first-seed 100] [--workers N] [--runs FOLDER]
                              [--json FILE] [--markdown FILE]
 
-For each environment of ``knntd.yml`` and ``exa.yml`` an agent is trained with each seed, as ``sb3-knntd train`` does
-it, and then plays 100 greedy episodes in environments of its own. A run is kept in the folder and not done again until
-its configuration changes; after a change of the algorithms themselves, take another folder. Failures, such as a missing
-simulator, are reported at the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
+For each environment of the files an agent is trained with each seed, as ``sb3-knntd train`` does it, and then plays 100
+greedy episodes in environments of its own. A run is kept in the folder and not done again until its configuration
+changes; after a change of the algorithms themselves, take another folder. Failures, such as a missing simulator, are
+reported at the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -37,11 +36,11 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 from benchmarks.machine import describe
 from sb3_knntd import VecDeltaFilter
 from sb3_knntd.common.files import replace_file
-from sb3_knntd.distributed.jobs import Job, run_jobs
+from sb3_knntd.distributed.jobs import Job, run_jobs, stored_as
+from sb3_knntd.registry import Role, with_role
 from sb3_knntd.zoo import register
 from sb3_knntd.zoo.experiment import KNNExperimentManager
 
-ALGORITHMS = ("knntd", "exa")
 EPISODES, EVALUATION_ENVS = 100, 10
 #: Environments for evaluation are seeded apart from those for training.
 EVALUATION_SEED = 10_000
@@ -116,10 +115,10 @@ class Row(NamedTuple):
 
 def configurations() -> dict[tuple[str, str], dict[str, Any]]:
     """
-    :return: what the two files of ``zoo_configs/`` have for an environment, by algorithm and environment
+    :return: what the files of ``zoo_configs/`` have for an environment, by algorithm and environment
     """
-    folder = files("sb3_knntd.zoo_configs")
-    stored = {algo: yaml.safe_load(folder.joinpath(f"{algo}.yml").read_text()) for algo in ALGORITHMS}
+    paths = {name: algorithm.config_path for name, algorithm in with_role(Role.OWN).items()}
+    stored = {algo: yaml.safe_load(path.read_text(encoding="utf-8")) for algo, path in paths.items() if path}
     return {
         (algo, env_id): settings
         for algo, by_env in stored.items()
@@ -128,6 +127,8 @@ def configurations() -> dict[tuple[str, str], dict[str, Any]]:
     }
 
 
+# Run by ``python -m`` it was stored under the other name.
+@stored_as("benchmarks.zoo.play", "__main__.play")
 def play(algo: str, env_id: str, settings: Mapping[str, Any], seed: int, episodes: int) -> dict[str, Any]:
     """
     :param algo: algorithm

@@ -28,9 +28,10 @@ from sb3_knntd.callbacks import (
 )
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_knntd import KNNTD, ExA
-from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.registry import ALGORITHMS
 
+#: By algorithm, the environment that it learns, and the two dimensions that are drawn.
+RUNS = {"knntd": ("MountainCar-v0", (0, 1)), "exa": ("Pendulum-v1", (0, 2))}
 #: Where TensorBoard says it can be reached.
 ADDRESS = re.compile(r"http://\S+:\d+/")
 CHROMIUM = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
@@ -65,19 +66,15 @@ TIMEOUT = 60_000
 
 def train(folder: Path, n_steps: int, n_pictures: int) -> Path:
     """
-    Train KNNTD on MountainCar-v0 and ExA on Pendulum-v1 with all callbacks.
+    Train each algorithm of :data:`RUNS` with all callbacks.
 
     :param folder: where files are written, a folder for each algorithm
     :param n_steps: number of steps of each
     :param n_pictures: how many maps and videos are made of each
     :return: where TensorBoard's logs are
     """
-    runs: list[tuple[type[KNNAlgorithm], str, tuple[int, int]]] = [
-        (KNNTD, "MountainCar-v0", (0, 1)),
-        (ExA, "Pendulum-v1", (0, 2)),
-    ]
-    for algorithm, env_id, dims in runs:
-        files, freq = folder / algorithm.__name__, n_steps // n_pictures
+    for name, (env_id, dims) in RUNS.items():
+        files, freq = folder / name, n_steps // n_pictures
         callbacks: list[BaseCallback] = [
             ValueMapCallback(dims=dims, average=True, draw_freq=freq, folder=files),
             PerceptionStatsCallback(log_freq=n_steps // 20),
@@ -85,7 +82,8 @@ def train(folder: Path, n_steps: int, n_pictures: int) -> Path:
             EpisodeVideoCallback(gym.make(env_id, render_mode="rgb_array"), video_freq=freq, folder=files),
             HParamCallback(),
         ]
-        model = algorithm(env_id, seed=0, tensorboard_log=str(folder / "logs"))
+        algorithm = ALGORITHMS[name]
+        model = algorithm.load()(algorithm.policy, env_id, seed=0, tensorboard_log=str(folder / "logs"))
         model.learn(n_steps, callback=callbacks)
     return folder / "logs"
 
@@ -163,9 +161,8 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         logs = train(Path(folder), arguments.steps, 5)
-        for algorithm in ("KNNTD", "ExA"):
-            files = Path(folder) / algorithm
-            name = algorithm.lower()
+        for name in RUNS:
+            files = Path(folder) / name
             shutil.copyfile(
                 files / f"value_map_{arguments.steps}.png", arguments.out / f"callback_value_map_{name}.png"
             )

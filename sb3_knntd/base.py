@@ -1,24 +1,20 @@
-"""The learning loop that every algorithm here shares, as an SB3 algorithm."""
+"""What KNNTD and ExA share: parameters, spaces, the learner, saving and loading."""
 
 from __future__ import annotations
 
 import io
 import pathlib
 import pickle
-import sys
-import time
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
-from math import isfinite
-from statistics import fmean
 from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import is_json_serializable
@@ -26,8 +22,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_knntd.actions.selection import ActionRule
-from sb3_knntd.common.callback_dispatcher import Audience
+from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.checks import (
     PROGRESS,
     check_flag,
@@ -39,12 +34,15 @@ from sb3_knntd.common.checks import (
     shown,
 )
 from sb3_knntd.common.files import read_description, replacing
+from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.common.plain import encodable, objects_for
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.schedules import check_rate, make_schedule
-from sb3_knntd.kernels.step import UNDRAWN
-from sb3_knntd.learners.base import Form, Learner, Rates, TorchLearner, check_finite, check_transition
-from sb3_knntd.learners.compiled import CompiledLearner
+from sb3_knntd.common.transitions import check_transition
+from sb3_knntd.kernels.selection import UNDRAWN
+from sb3_knntd.kernels.state import UpdateConfig
+from sb3_knntd.learners import CompiledLearner, Learner, Rates, TorchLearner
+from sb3_knntd.online_algorithm import OnlineAlgorithm
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.q_table import DenseTable
@@ -56,9 +54,9 @@ NONE_TRUNCATED: dict[int, np.ndarray] = {}
 LARGEST_SEED = 2**32 - 1
 
 
-class KNNAlgorithm(BaseAlgorithm):
+class KNNAlgorithm(OnlineAlgorithm):
     """
-    What the algorithms of this package share: spaces, parameters, the learning loop, saving and loading.
+    What the algorithms of this package share: parameters, spaces, the learner, saving and loading.
 
     The parameters are those of :class:`~sb3_knntd.KNNTD`.
     """
@@ -67,10 +65,25 @@ class KNNAlgorithm(BaseAlgorithm):
     learner: Learner
     trace_schedule: Schedule
     exploration_schedule: Schedule
-    exploration_initial_eps: float
-    exploration_final_eps: float
-    exploration_fraction: float
+    exploration_initial_eps: Any = Hyperparameter()
+    exploration_final_eps: Any = Hyperparameter()
+    exploration_fraction: Any = Hyperparameter()
+    learning_rate: Any = Hyperparameter()
+    gamma: Any = Hyperparameter()
+    trace_decay: Any = Hyperparameter()
+    step_size: Any = Hyperparameter()
+    traces: Any = Hyperparameter()
+    reset_other_actions: Any = Hyperparameter()
+    tie_break: Any = Hyperparameter()
+    n_neighbors: Any = FixedHyperparameter()
+    points: Any = FixedHyperparameter()
+    bounds: Any = FixedHyperparameter()
+    weights: Any = FixedHyperparameter()
+    bandwidth: Any = FixedHyperparameter()
+    search: Any = FixedHyperparameter()
+    initial_value: Any = FixedHyperparameter()
 
+    _is_set_up = False
     #: What a saved file calls the algorithm: subclasses read each other's.
     _algorithm: ClassVar[str]
     #: What an action space must be, and what to do with another.
@@ -144,16 +157,12 @@ class KNNAlgorithm(BaseAlgorithm):
         self._normalized = normalizes_observations(self.env)
         #: ε or the temperature at the last step
         self.exploration_rate = 0.0
-        self._last_actions: np.ndarray | None = None
-        # What the last step led to, and while callbacks are told of a step what was acted on in it.
-        self._standing: np.ndarray | None = None
-        self._acted_on: np.ndarray | None = None
         self._n_measured = 0
         self._measuring = False
 
     @abstractmethod
-    def _make_rule(self) -> ActionRule:
-        """Check the parameters of the action rule and make it."""
+    def _make_selector(self) -> ActionSelector:
+        """Check the parameters of action selection and make the selector."""
 
     def _policy_arguments(self) -> dict[str, Any]:
         """Arguments of the policy besides those that all algorithms have."""
@@ -237,13 +246,9 @@ class KNNAlgorithm(BaseAlgorithm):
     def _setup_model(self) -> None:
         if not hasattr(self, "observation_space"):
             raise ValueError(f"env must be given to build a model: {type(self).__name__}(env)")
+        self._is_set_up = False
         self._check_parameters()
-        self._setup_lr_schedule()
-        self.trace_schedule = make_schedule(self.trace_decay)
-        # What stays as it is need not be asked for: a call more is felt in steps this short.
-        rates = self.learning_rate, self.trace_decay
-        self._constant_rates = [rate if isinstance(rate, float) else None for rate in rates]
-        self.exploration_schedule = self._make_exploration_schedule()
+        self._make_schedules()
         known = {"dtype", "table", "compiled"}
         if not (isinstance(self.policy_kwargs, dict) and self.policy_kwargs.keys() <= known):
             raise ValueError(
@@ -265,26 +270,56 @@ class KNNAlgorithm(BaseAlgorithm):
             **self.policy_kwargs,
         ).to(self.device)
         self._warn_of_overshooting()
-        self._rule = rule = self._make_rule()
-        self._stream = RandomStream((self.n_envs, 2, rule.n_uniforms))
-        self._prediction_stream = RandomStream((rule.n_uniforms,), purpose=1)
+        self.policy.selector = selector = self._make_selector()
+        self._stream = RandomStream((self.n_envs, 2, selector.n_uniforms))
+        self._prediction_stream = RandomStream((selector.n_uniforms,), purpose=1)
         if self.verbose >= 1:
             print(
                 f"Neighbours by search={self.policy.search_name!r} over {self.policy.perceiver.points.n_points} points"
             )
-        form = Form(
-            self.gamma, self.step_size == "normalized", self.traces == "accumulating", bool(self.reset_other_actions)
-        )
-        self.learner = self._make_learner(rule, form)
+        self.learner = self._make_learner()
         self._adapts = self.policy.perceiver.bounds.adaptive
         self.set_random_seed(self.seed)
+        self._is_set_up = True
 
-    def _make_learner(self, rule: ActionRule, form: Form) -> Learner:
-        perceiver, table = self.policy.perceiver, self.policy.table
-        if self.policy.is_compiled:
-            return CompiledLearner(perceiver, table, rule, self._stream, self.n_envs, form)
-        assert isinstance(table, DenseTable)
-        return TorchLearner(perceiver, table, rule, self._stream, self.n_envs, form, one_step=self.trace_decay == 0.0)
+    def _make_schedules(self) -> None:
+        self._setup_lr_schedule()
+        self.trace_schedule = make_schedule(self.trace_decay)
+        self.exploration_schedule = self._make_exploration_schedule()
+
+    def _reconfigure(self) -> None:
+        self._is_set_up = False
+        try:
+            self._check_parameters()
+            selector = self._make_selector()
+            if selector.n_uniforms != self.policy.selector.n_uniforms:
+                raise ValueError(
+                    "exploration cannot be changed to one that takes another number of random numbers: save the "
+                    f"model, and load it with the new one, {type(self).__name__}.load(path, exploration=...)"
+                )
+            self._make_schedules()
+            self.policy.selector = selector
+            self.learner.configure(selector, self._update_config())
+        finally:
+            self._is_set_up = True
+
+    def _make_learner(self) -> Learner:
+        policy, config = self.policy, self._update_config()
+        if policy.is_compiled:
+            return CompiledLearner(policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config)
+        assert isinstance(policy.table, DenseTable)
+        one_step = self.trace_decay == 0.0
+        return TorchLearner(
+            policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config, one_step=one_step
+        )
+
+    def _update_config(self) -> UpdateConfig:
+        return UpdateConfig(
+            gamma=self.gamma,
+            normalized=self.step_size == "normalized",
+            accumulating=self.traces == "accumulating",
+            reset_other_actions=bool(self.reset_other_actions),
+        )
 
     def _setup_lr_schedule(self) -> None:
         self.lr_schedule = make_schedule(self.learning_rate)
@@ -377,56 +412,16 @@ class KNNAlgorithm(BaseAlgorithm):
         greedy, state = self.policy.predict(observation, state, episode_start, deterministic)
         if deterministic:
             return greedy, state
+        selector = self.policy.selector
         rows, probabilities = self.policy.perceived_rows(np.asarray(observation))
         uniforms = th.from_numpy(np.stack([self._prediction_stream.next().copy() for _ in range(len(rows))]))
         uniforms, rate = uniforms.to(rows.device), self.exploration_rate
-        nothing = th.full((len(rows), len(self._rule.blocks) - 1), UNDRAWN, device=rows.device)
-        held = self._rule.hold(nothing, uniforms, rate, th.zeros(len(rows), device=rows.device))
-        choice = self._rule.choose(rows, probabilities, uniforms, rate, held)
-        return self.policy.fit_actions(choice.actions.cpu().numpy()).reshape(greedy.shape), state
+        nothing = th.full((len(rows), selector.n_factors), UNDRAWN, device=rows.device)
+        persistent = selector.persist(nothing, uniforms, rate, th.zeros(len(rows), device=rows.device))
+        selection = selector.select(rows, probabilities, uniforms, rate, persistent)
+        return self.policy.fit_actions(selection.actions.cpu().numpy()).reshape(greedy.shape), state
 
     # --------------------------------------------------------------- learning
-
-    def learn(
-        self: SelfKNNAlgorithm,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int | None = 4,
-        tb_log_name: str = "KNN",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfKNNAlgorithm:
-        """
-        Learn from ``total_timesteps`` steps in the environment, from each in the step that made it.
-
-        If a dimension of the observations has no range (infinite bounds, or VecNormalize), the first 1000
-        steps (at least 100 of each environment) act at random to find it. They count, and teach no values.
-
-        :param total_timesteps: number of environment steps, over all environments together
-        :param callback: called at every step, after it has been learned from
-        :param log_interval: number of episodes between logs, ``None`` for none
-        :param tb_log_name: name of the run in TensorBoard
-        :param reset_num_timesteps: whether to count steps from 0; if not, training goes on where it was
-        :param progress_bar: whether to show a progress bar (tqdm and rich)
-        :return: the model
-        :raises ValueError: if ``total_timesteps`` is no number, or an environment returns an observation or reward that
-            is not finite. The table is untouched by that step
-        """
-        # As SB3, which takes 1e6 as well, and does nothing for numbers below 1; but NaN would be no steps, unnoticed.
-        check_number("total_timesteps", total_timesteps)
-        total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        self._measuring = self._must_measure()
-        callback.on_training_start(locals(), globals())
-        audience = Audience(callback)
-        while self.num_timesteps < total_timesteps:
-            if not self._step(audience, log_interval):
-                break
-        audience.catch_up(self.num_timesteps)
-        self.policy.set_training_mode(False)
-        callback.on_training_end()
-        return self
 
     def _setup_learn(
         self,
@@ -436,139 +431,55 @@ class KNNAlgorithm(BaseAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        if self.env is None:
-            raise ValueError("there is no environment to learn from: call set_env(env) first")
-        if reset_num_timesteps or self._last_obs is None:
-            # The environments are about to be reset, and with them the episodes and the actions chosen in them.
-            self._last_actions = None
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        answer = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self.learner.table is not self.policy.table:
             raise ValueError(
                 "model.policy has been replaced, and what is learned would go to the one that the model was made with. "
                 "Leave that one, and have it take over what the other has learned: "
                 "model.policy.load_state_dict(other.state_dict()), with the points, bounds and dtype of the other"
             )
-        self._standing = self._last_obs  # type: ignore[assignment]
-        if total_timesteps > self.num_timesteps:
-            self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
-        return total_timesteps, callback
+        self._measuring = self._must_measure()
+        return answer
 
-    def _step(self, audience: Audience, log_interval: int | None) -> bool:
-        """
-        One step in every environment, and what is learned from it.
+    def _act(self) -> np.ndarray:
+        if self._measuring:
+            return self.policy.fit_actions(self._random_actions())
+        learner = self.learner
+        if not learner.in_episodes:
+            assert isinstance(self._last_obs, np.ndarray)
+            learner.begin(self._last_obs, self._rates().exploration)
+        return self.policy.fit_actions(learner.actions)
 
-        :param audience: who is told
-        :param log_interval: number of episodes between logs
-        :return: whether to go on
-        """
-        env = self.env
-        assert env is not None
-        for listener in audience.listeners:
-            listener.on_rollout_start()
-        last_obs = self._last_obs
-        if last_obs is not self._standing:
-            # A callback has moved the environments, or has given others, which need a reset if it did not say where.
-            self._last_actions = None
-            if last_obs is None:
-                self._last_obs = last_obs = env.reset()  # type: ignore[assignment]
-        actions = self._last_actions
-        if actions is None or self._measuring:
-            actions = self._random_actions() if self._measuring else self._first_actions()
-        actions = self.policy.fit_actions(actions)
-        new_obs, rewards, dones, infos = env.step(actions)
-        n_before = self.num_timesteps
-        self.num_timesteps += env.num_envs
-        self._current_progress_remaining = progress_remaining(self.num_timesteps, self._total_timesteps)
-        try:
-            ended = dones.tolist()
-            any_ended = True in ended
-            truncated = self._truncated(ended, infos) if any_ended else NONE_TRUNCATED
-            if self._measuring:
-                self._measure(new_obs, rewards, truncated)  # type: ignore[arg-type]
-            else:
-                self._last_actions = self.learner.learn(
-                    new_obs,  # type: ignore[arg-type]
-                    rewards,
-                    dones,
-                    truncated,
-                    self._rates(),
-                )
-        except (ValueError, FloatingPointError) as error:
-            step, self.num_timesteps = self.num_timesteps, n_before
-            # What was going on in the environments is lost with this step: to go on is to begin anew.
-            self._last_obs = self._last_actions = None
-            raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
-        self._standing = new_obs  # type: ignore[assignment]
-        n_logs = 0
-        reported = any_ended
-        for info in infos:
-            if "episode" in info:
-                reported = True
-        if reported:
-            self._update_info_buffer(infos, dones)
-        if any_ended:
-            before = self._episode_num
-            self._episode_num += ended.count(True)
-            n_logs = self._episode_num // log_interval - before // log_interval if log_interval else 0
+    def _learn_from(
+        self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        truncated = self._truncated(dones, infos) if dones.any() else NONE_TRUNCATED
+        if self._measuring:
+            self._measure(new_obs, rewards, truncated)
+            return
+        self.learner.step(new_obs, rewards, dones, truncated, self._rates())
+        if self._adapts and not self.policy.perceiver.sees(new_obs):
+            self._widen(new_obs)
 
-        if self._adapts and not (self._measuring or self.policy.perceiver.sees(new_obs)):  # type: ignore[arg-type]
-            self._widen(new_obs)  # type: ignore[arg-type]
-
-        # What is seen is handed on and not copied: SB3's algorithms hold on to what a VecEnv returned as well.
-        if audience.members and audience.hears(new_obs, any_ended):  # type: ignore[arg-type]
-            self._acted_on = last_obs  # type: ignore[assignment]
-            try:
-                go_on = audience.tell(locals(), self.num_timesteps)
-            finally:
-                self._move_on()
-                self._acted_on = None
-            if not go_on:
-                return False
-        else:
-            self._last_obs = new_obs  # type: ignore[assignment]
-        if n_logs:
-            self.dump_logs()
-        for listener in audience.listeners:
-            listener.on_rollout_end()
-        return True
-
-    def _move_on(self) -> None:
-        """Be where the step led, or where a callback that was told of it says: episodes begin there."""
-        if self._last_obs is self._acted_on:
-            self._last_obs = self._standing
-        else:
-            self._last_actions = None
+    def _abandon_episodes(self) -> None:
+        self.learner.abandon_episodes()
 
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
-        self.exploration_rate = rate = self.exploration_schedule(progress)
-        alpha, trace_decay = self._constant_rates
-        if alpha is None:
-            alpha = self.lr_schedule(progress)
-        if trace_decay is None:
-            trace_decay = self.trace_schedule(progress)
-        return alpha, trace_decay, rate
+        self.exploration_rate = exploration = self.exploration_schedule(progress)
+        return Rates(self.lr_schedule(progress), self.trace_schedule(progress), exploration)
 
-    def _first_actions(self) -> np.ndarray:
-        """The actions chosen at the start of the episodes."""
-        assert isinstance(self._last_obs, np.ndarray)
-        self._last_actions = self.learner.begin(self._last_obs, self._rates()[2])
-        return self._last_actions
-
-    @staticmethod
-    def _truncated(ended: list[bool], infos: list[dict[str, Any]]) -> dict[int, np.ndarray]:
-        """The last observations of the episodes that a time limit ended; all that ended must be finite."""
+    def _truncated(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, np.ndarray]:
+        """The last observations of the episodes that a time limit ended. All that ended are checked."""
+        assert self._step_check is not None
         truncated = {}
-        for index, info in enumerate(infos):
-            if ended[index] and "terminal_observation" in info:
+        for env in np.flatnonzero(dones).tolist():
+            info = infos[env]
+            if "terminal_observation" in info:
                 last = np.asarray(info["terminal_observation"])
-                # Sooner than NumPy with few numbers, which only says where when there is something to say.
-                if not all(map(isfinite, last.ravel().tolist())):
-                    check_finite("a last observation", last[None], [index])
+                self._step_check.last_observation(env, last)
                 if info.get("TimeLimit.truncated", False):
-                    truncated[index] = last
+                    truncated[env] = last
         return truncated
 
     # -------------------------------------------- the range of open dimensions
@@ -577,8 +488,8 @@ class KNNAlgorithm(BaseAlgorithm):
         return self._n_measured < steps_to_measure(self.n_envs) and self.policy.perceiver.bounds.is_open
 
     def _random_actions(self) -> np.ndarray:
-        n_actions = self.policy.table.n_actions
-        return (self._stream.next()[:, 0, 0] * n_actions).astype(np.int64)
+        uniforms = self._stream.next()[:, 0]
+        return (uniforms[:, 0] * self.policy.table.n_actions).astype(np.int64)
 
     def _measure(self, observations: np.ndarray, rewards: np.ndarray, truncated: dict[int, np.ndarray]) -> None:
         check_transition(observations, rewards)
@@ -593,7 +504,7 @@ class KNNAlgorithm(BaseAlgorithm):
     def _widen(self, observations: np.ndarray) -> None:
         """Take in the last observations, and begin anew from there."""
         self.policy.widen(th.from_numpy(observations).to(self.device))
-        self._last_actions = None
+        self._abandon_episodes()
         self._tell_range(f"widened at step {self.num_timesteps}")
 
     def _tell_range(self, how: str) -> None:
@@ -607,32 +518,18 @@ class KNNAlgorithm(BaseAlgorithm):
 
     # ---------------------------------------------------------------- logging
 
-    def dump_logs(self) -> None:
-        """Write the log, under SB3's keys and the learner's own."""
-        assert self.ep_info_buffer is not None
-        assert self.ep_success_buffer is not None
-        elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
-        record = self.logger.record
-        record("time/episodes", self._episode_num, exclude="tensorboard")
-        record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
-        record("time/time_elapsed", int(elapsed), exclude="tensorboard")
-        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        if len(self.ep_info_buffer) > 0:
-            record("rollout/ep_rew_mean", fmean([info["r"] for info in self.ep_info_buffer]))
-            record("rollout/ep_len_mean", fmean([info["l"] for info in self.ep_info_buffer]))
-        if len(self.ep_success_buffer) > 0:
-            record("rollout/success_rate", fmean(self.ep_success_buffer))
-        for key, value in self.learner.summary().items():
-            record(f"train/{key}", value)
-        record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
-        record("train/exploration_rate", self.exploration_rate)
-        record("train/visited_points", self.policy.table.n_visited)
-        self.logger.dump(step=self.num_timesteps)
+    def _log(self) -> dict[str, float]:
+        summary = {f"train/{key}": value for key, value in self.learner.summary().items()}
+        return summary | {
+            "train/learning_rate": self.lr_schedule(self._current_progress_remaining),
+            "train/exploration_rate": self.exploration_rate,
+            "train/visited_points": self.policy.table.n_visited,
+        }
 
     # ------------------------------------------------------ saving and loading
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["_rule", "_stream", "_prediction_stream", "_standing", "_acted_on"]
+        ours = ["_stream", "_prediction_stream", "_is_set_up"]
         return [*super()._excluded_save_params(), *ours]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -653,7 +550,7 @@ class KNNAlgorithm(BaseAlgorithm):
         :param include: attributes to save although SB3 leaves them out
         """
         self._stream_states = [self._stream.state(), self._prediction_stream.state()]
-        shown = self._last_obs, self._last_actions
+        shown, in_episodes = self._last_obs, self.learner.in_episodes
         if self._acted_on is not None:
             # A callback saves: its file goes on where the next step does.
             self._move_on()
@@ -668,7 +565,7 @@ class KNNAlgorithm(BaseAlgorithm):
             with replacing(target) as file:
                 self._save(file, exclude, include)
         finally:
-            self._last_obs, self._last_actions = shown
+            self._last_obs, self.learner.in_episodes = shown, in_episodes
 
     def _save(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
         """Save to an open file, and beside what SB3 pickles there the same as data, for :meth:`load` without trust."""
@@ -728,6 +625,9 @@ class KNNAlgorithm(BaseAlgorithm):
             cause = error.__context__ if isinstance(error, KeyError) and error.__context__ else error
             raise ValueError(f"{path}: {cause}") from cause
         vars(model).pop("plain", None)
+        # Files of the first version have the next actions here, or None where new episodes were to begin.
+        if vars(model).pop("_last_actions", ...) is None:
+            model.learner.abandon_episodes()
         if env is not None:
             model._check_normalization(model.env)
         if model.n_envs != saved["n_envs"]:
@@ -736,8 +636,6 @@ class KNNAlgorithm(BaseAlgorithm):
             shape = (model.n_envs, *(model.observation_space.shape or ()))
             if getattr(model._last_obs, "shape", None) != shape:
                 raise ValueError(f"{path}: the last observations must have shape {shape}; got {model._last_obs!r:.200}")
-        if not model.learner.in_episodes:
-            model._last_actions = None
         # A seed that is given begins new sequences; without one the saved ones go on.
         if kwargs.get("seed") is None:
             for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
@@ -771,12 +669,3 @@ def check_device(device: Any) -> th.device:
         else:
             return found
     raise ValueError(f"device must be 'cpu', 'cuda', 'auto' or another of torch's; got {shown(device)}") from error
-
-
-def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
-    """
-    :param num_timesteps: steps so far; the last of several environments can go beyond the total
-    :param total_timesteps: steps in all
-    :return: the share that remains, from 1 to 0
-    """
-    return 1.0 - num_timesteps / total_timesteps if num_timesteps < total_timesteps else 0.0

@@ -11,9 +11,11 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
-from sb3_knntd.actions.selection import ActionRule, ContinuousRule
+from sb3_knntd.actions.selection import ActionSelector, MeanActionSelector
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.common.checks import check_number, check_word, shown
+from sb3_knntd.common.checks import check_member, check_number, shown
+from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
+from sb3_knntd.kernels.selection import Exploration
 from sb3_knntd.policies import ExAPolicy
 
 #: ``exploration_hold="auto"``: what share of an episode. A pole falls within fifty steps if something is tried for
@@ -59,6 +61,10 @@ class ExA(KNNAlgorithm):
     """
 
     policy: ExAPolicy
+    action_points: Any = FixedHyperparameter()
+    action_table: Any = FixedHyperparameter()
+    exploration: Any = Hyperparameter()
+    exploration_hold: Any = Hyperparameter()
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": ExAPolicy}
     _algorithm: ClassVar[str] = "ExA"
     _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Box
@@ -144,22 +150,20 @@ class ExA(KNNAlgorithm):
     def _policy_arguments(self) -> dict[str, Any]:
         return {"action_points": self.action_points, "action_table": self.action_table}
 
-    def _make_rule(self) -> ActionRule:
-        check_word("exploration", self.exploration, ["shared", "per_neighbor"])
-        columns = self.policy.columns
-        least_hold, hold_share = self._hold()
-        return ContinuousRule(
-            columns.points,
-            columns.blocks,
-            self.exploration == "shared",
-            least_hold,
-            hold_share,
+    def _make_selector(self) -> ActionSelector:
+        exploration = check_member("exploration", self.exploration, (Exploration.SHARED, Exploration.PER_NEIGHBOR))
+        min_persistence, persistence_share = self._persistence()
+        return MeanActionSelector(
+            self.policy.columns,
+            exploration,
+            min_persistence,
+            persistence_share,
             self.policy.n_neighbors,
             self.tie_break == "random",
         )
 
-    def _hold(self) -> tuple[float, float]:
-        """For how many steps a draw is held at least, and for what share of an episode."""
+    def _persistence(self) -> tuple[float, float]:
+        """For how many steps a draw is kept at least, and for what share of an episode."""
         if not isinstance(self.exploration_hold, str):
             return check_number("exploration_hold", self.exploration_hold, 1.0, LONGEST_HOLD), 0.0
         if self.exploration_hold != "auto":
@@ -173,11 +177,9 @@ class ExA(KNNAlgorithm):
         return self._make_epsilon_schedule()
 
     def _random_actions(self) -> np.ndarray:
-        uniforms, columns = self._stream.next()[:, 0], self.policy.columns
-        n_blocks = len(columns.blocks) - 1
-        sizes = np.diff(columns.blocks)
-        drawn = columns.blocks[:-1] + (uniforms[:, 2 : 2 + n_blocks] * sizes).astype(np.int64)
-        actions: np.ndarray = columns.points[drawn].sum(axis=1)
+        selector = self.policy.selector
+        columns = selector.random_columns(self._stream.next()[:, 0, 2 : 2 + selector.n_factors])
+        actions: np.ndarray = self.policy.columns.points[columns].sum(axis=1)
         return actions
 
     def learn(

@@ -11,10 +11,12 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_knntd.actions.exploration import EXPLORATIONS
-from sb3_knntd.actions.selection import ActionRule, DiscreteRule
+from sb3_knntd.actions.selection import ActionSelector, MeanValueSelector
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.common.checks import LEAST, check_word
+from sb3_knntd.common.checks import LEAST, check_member, check_word
+from sb3_knntd.common.hyperparameters import Hyperparameter
 from sb3_knntd.common.schedules import check_rate, make_schedule
+from sb3_knntd.kernels.selection import Target
 from sb3_knntd.policies import KNNPolicy
 
 SelfKNNTD = TypeVar("SelfKNNTD", bound="KNNTD")
@@ -81,6 +83,9 @@ class KNNTD(KNNAlgorithm):
     :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
     """
 
+    target: Any = Hyperparameter()
+    exploration: Any = Hyperparameter()
+    temperature: Any = Hyperparameter()
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": KNNPolicy}
     _algorithm: ClassVar[str] = "KNNTD"
     _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
@@ -154,11 +159,11 @@ class KNNTD(KNNAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
-    def _make_rule(self) -> ActionRule:
-        check_word("target", self.target, ["sarsa", "q_learning", "expected_sarsa"])
-        return DiscreteRule(
-            self.policy.table.n_actions, self.target, EXPLORATIONS[self.exploration](), self.tie_break == "random"
-        )
+    def _make_selector(self) -> ActionSelector:
+        target = check_member("target", self.target, Target)
+        check_word("exploration", self.exploration, EXPLORATIONS)
+        exploration = EXPLORATIONS[self.exploration]()
+        return MeanValueSelector(self.policy.columns, target, exploration, self.tie_break == "random")
 
     def _make_exploration_schedule(self) -> Schedule:
         check_word("exploration", self.exploration, EXPLORATIONS)

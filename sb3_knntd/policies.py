@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from itertools import pairwise
 from typing import Any, ClassVar
 
 import cloudpickle
@@ -14,23 +13,23 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_knntd.actions.columns import ActionColumns, make_action_columns
-from sb3_knntd.actions.exploration import greedy
-from sb3_knntd.actions.selection import mean_actions, mean_rows
+from sb3_knntd.actions.columns import ActionColumns, discrete_columns, make_action_columns
+from sb3_knntd.actions.exploration import EpsilonGreedy
+from sb3_knntd.actions.selection import ActionSelector, MeanActionSelector, MeanValueSelector, mean_rows
 from sb3_knntd.common.checks import check_flag, check_number, check_size, check_word, shown
+from sb3_knntd.common.interrupts import interrupts_held
 from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels import jit
-from sb3_knntd.kernels.step import best_entries
-from sb3_knntd.perception import Lattice, Perceiver, Perception, Points, make_bounds, make_points, make_weights
-from sb3_knntd.perception.points import count_neighbors
-from sb3_knntd.perception.search import SEARCHES, make_search
+from sb3_knntd.kernels.selection import Exploration, Target
+from sb3_knntd.kernels.traces import LARGEST_VALUE
+from sb3_knntd.learners.compiled import GreedyReader
+from sb3_knntd.perception import Lattice, Perception, PerceptionConfig, Points, make_perceiver
+from sb3_knntd.perception.search import SEARCHES
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.q_table import DenseTable, HashedTable, QTable
 
 #: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
 DENSE_TABLE_BYTES = 2**28
-#: Action values are taken up to this: sums of them stay finite in float32 too.
-LARGEST_VALUE = 1e30
 
 
 class KNNPolicy(BasePolicy):
@@ -60,8 +59,6 @@ class KNNPolicy(BasePolicy):
 
     #: the action spaces that it is for
     acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
-    #: whether one action is chosen from the average of the neighbours' rows
-    _AVERAGES: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -86,46 +83,43 @@ class KNNPolicy(BasePolicy):
         if not isinstance(dtype, th.dtype) or dtype not in (th.float32, th.float64):
             raise ValueError(f"policy_kwargs: dtype must be torch.float64 or torch.float32; got {shown(dtype)}")
         compiled = check_flag("policy_kwargs: compiled", compiled)
+        perception = PerceptionConfig(n_neighbors, points, bounds, weights, bandwidth, search)
         self._arguments = {
-            "n_neighbors": n_neighbors,
-            "points": points,
-            "bounds": bounds,
-            "weights": weights,
-            "bandwidth": bandwidth,
-            "search": search,
+            **vars(perception),
             "initial_value": initial_value,
             "dtype": dtype,
             "table": table,
             "compiled": compiled,
             "bounds_from_space": bounds_from_space,
         }
-        places = make_points(points, observation_space)
-        self.n_neighbors = count_neighbors(n_neighbors, observation_space, places.n_points, places.obs_dim)
-        self.perceiver = Perceiver(
-            make_bounds(bounds, observation_space, from_space=bounds_from_space),
-            places,
-            make_search(search, places, self.n_neighbors),
-            make_weights(weights, bandwidth, self.n_neighbors),
-        )
+        self.perceiver = make_perceiver(perception, observation_space, bounds_from_space=bounds_from_space)
+        self.n_neighbors = self.perceiver.search.n_neighbors
         self._compilable = compiled and jit.AVAILABLE and isinstance(self.perceiver.weights, KernelWeights)
         if compiled and not jit.AVAILABLE:
             warnings.warn(
                 f"numba cannot be used ({jit.REASON}): learning goes by torch operations, slower", stacklevel=2
             )
-        if columns is None:
-            assert isinstance(action_space, spaces.Discrete)
-            n_actions = int(action_space.n)
-            columns = ActionColumns(np.empty((n_actions, 0)), np.array([0, n_actions]), [])
-            # An array is added faster than a number.
-            self._first_action = np.asarray(action_space.start)
         #: what each column of the table stands for
-        self.columns = columns
-        self.table = self._make_table(table, places, int(columns.blocks[-1]), initial_value, dtype)
+        self.columns = self._default_columns() if columns is None else columns
+        n_actions = int(self.columns.factors[-1])
+        self.table = self._make_table(table, self.perceiver.points, n_actions, initial_value, dtype)
+        #: selects actions; the algorithm replaces it by one that explores
+        self.selector = self._greedy_selector()
+        self._reader: GreedyReader | None = None
         check_size(
             f"n_neighbors: the action values of {self.n_neighbors} neighbours",
-            8 * self.n_neighbors * int(columns.blocks[-1]),
+            8 * self.n_neighbors * n_actions,
             "give fewer neighbours",
         )
+
+    def _default_columns(self) -> ActionColumns:
+        assert isinstance(self.action_space, spaces.Discrete)
+        # An array is added faster than a number.
+        self._first_action = np.asarray(self.action_space.start)
+        return discrete_columns(int(self.action_space.n))
+
+    def _greedy_selector(self) -> ActionSelector:
+        return MeanValueSelector(self.columns, Target.SARSA, EpsilonGreedy(), random_ties=False)
 
     def _make_table(self, table: str, places: Points, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
         check_word("policy_kwargs: table", table, ["auto", "dense", "hashed"])
@@ -192,9 +186,28 @@ class KNNPolicy(BasePolicy):
 
         :param observations: shape (batch, *obs_shape), any number type, observation units
         """
-        regridding = self.perceiver.widen(observations)
-        if regridding is not None:
-            self.table.carry_over(regridding)
+        before = {name: value.clone() for name, value in self.perceiver.bounds.state_dict().items()}
+        with self.table.lock, interrupts_held():
+            try:
+                regridding = self.perceiver.widen(observations)
+                if regridding is not None:
+                    self.table.carry_over(regridding)
+            except BaseException:
+                self.perceiver.bounds.load_state_dict(before)
+                self.perceiver.fit()
+                raise
+
+    def add_points(self, points: np.ndarray | th.Tensor) -> None:
+        """
+        Add scattered points. Each is given the values that the table has there; traces are dropped.
+
+        :param points: shape (n_new, obs_dim), observation units
+        :raises ValueError: if the points are a lattice, or the new ones do not fit
+        """
+        values = self.q_values(points)
+        with self.table.lock, interrupts_held():
+            self.perceiver.add_points(points)
+            self.table.add_rows(values)
 
     def perceive(self, observation: np.ndarray | th.Tensor) -> Perception:
         """
@@ -209,6 +222,14 @@ class KNNPolicy(BasePolicy):
         :return: Q(s, ·) = Σ p(i) Q(i, ·) (eq. 8), shape (batch, n_actions)
         """
         return mean_rows(*self.perceived_rows(observation))
+
+    def state_values(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
+        """
+        :param observation: one observation, or a batch, observation units
+        :return: what the states are worth if the greedy action is taken: max Q(s, ·) (eq. 12), for Ex⟨a⟩
+            Σ p(i) max Q(i, ·) (eq. 25), shape (batch,)
+        """
+        return self.selector.greedy_value(*self.perceived_rows(observation))
 
     def perceived_rows(self, observation: np.ndarray | th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -240,29 +261,13 @@ class KNNPolicy(BasePolicy):
         if not self.is_compiled or len(batch) > 1 or (*batch, *shape) != array.shape:
             actions, state = super().predict(observation, state, episode_start, deterministic)
             return actions.astype(self.action_space.dtype), state
-        entries, probabilities = self._best_entries(array.reshape(-1, self.perceiver.bounds.obs_dim))
-        actions = self._recommended(entries, probabilities)
-        return actions.reshape((*batch, *(self.action_space.shape or ()))), state
-
-    def _best_entries(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The columns that the neighbours recommend, (batch, k, n_blocks), and how much each counts, (batch, k)."""
+        observations = array.reshape(-1, self.perceiver.bounds.obs_dim)
         if not np.isfinite(observations).all():
             raise ValueError(f"observation must be finite; got {observations.tolist()}")
-        n, k = len(observations), self.n_neighbors
-        eyes = self.perceiver.eyes
-        assert eyes is not None
-        if self.perceiver.search_is_outside:
-            neighbors = self.perceiver.find(th.from_numpy(observations))
-            indices, probabilities = neighbors.indices.numpy(), neighbors.squared_distances.numpy()
-        else:
-            indices, probabilities = np.empty((n, k), np.int64), np.empty((n, k))
-        self.table.sync()
-        values, _, _, row_slots, initial = self.table.arrays()
-        seen = observations.astype(np.float64)
-        blocks = self.columns.blocks
-        entries = np.empty((n, k, len(blocks) - 1), np.int64)
-        best_entries(seen, eyes, indices, probabilities, values, row_slots, initial, blocks, self._AVERAGES, entries)
-        return entries, probabilities
+        if self._reader is None:
+            self._reader = GreedyReader(self.perceiver, self.table, self._greedy_selector())
+        actions = self._recommended(*self._reader(observations))
+        return actions.reshape((*batch, *(self.action_space.shape or ()))), state
 
     def fit_actions(self, actions: np.ndarray) -> np.ndarray:
         """
@@ -274,9 +279,9 @@ class KNNPolicy(BasePolicy):
             fitting += self._first_action
         return fitting
 
-    def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
-        """Actions of the environment, (batch, *action_shape), from what the neighbours recommend."""
-        return self.fit_actions(entries[:, 0, 0])
+    def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+        """Actions of the environment, (batch, *action_shape), from the columns that the neighbours select."""
+        return self.fit_actions(action_indices[:, 0, 0])
 
     def forward(self, observation: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
@@ -289,7 +294,9 @@ class KNNPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         assert isinstance(self.action_space, spaces.Discrete)
-        return greedy(mean_rows(*self._exact_rows(observation))) + int(self.action_space.start)
+        rows, probabilities = self._exact_rows(observation)
+        selected = self.selector.greedy_indices(rows, probabilities)
+        return self.selector.actions_of(selected, probabilities) + int(self.action_space.start)
 
     def _to_tensor(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         array = observation.cpu().numpy() if isinstance(observation, th.Tensor) else np.asarray(observation)
@@ -382,7 +389,6 @@ class ExAPolicy(KNNPolicy):
     """
 
     acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Box
-    _AVERAGES: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -403,7 +409,6 @@ class ExAPolicy(KNNPolicy):
         self._action_shape = None if len(action_space.shape) == 1 else (-1, *action_space.shape)
         # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
         self._can_exceed = action_space.dtype != np.float32
-        self._column_points = th.from_numpy(columns.points)
         self._action_bounds = [th.from_numpy(bound) for bound in (action_space.low, action_space.high)]
 
     @property
@@ -427,19 +432,20 @@ class ExAPolicy(KNNPolicy):
             np.minimum(fitting, self.action_space.high, out=fitting)
         return fitting
 
-    def _recommended(self, entries: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
-        return self.fit_actions((probabilities[..., None] * self.columns.points[entries].sum(axis=2)).sum(axis=1))
+    def _greedy_selector(self) -> ActionSelector:
+        return MeanActionSelector(self.columns, Exploration.SHARED, 1.0, 0.0, self.n_neighbors, random_ties=False)
+
+    def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+        points = self.columns.points[action_indices].sum(axis=2)
+        return self.fit_actions((probabilities[..., None] * points).sum(axis=1))
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         rows, probabilities = self._exact_rows(observation)
-        blocks = self.columns.blocks.tolist()
-        entries = [first + greedy(rows[..., first:end]) for first, end in pairwise(blocks)]
-        points = self._column_points.to(probabilities)
-        actions = mean_actions(th.stack(entries, dim=2), probabilities, points)
+        actions = self.selector.actions_of(self.selector.greedy_indices(rows, probabilities), probabilities)
         # As fit_actions, in torch operations, so that it can be traced.
         if self._actions_are_whole:
             actions = actions.round()
-        low, high = (bound.to(points.device) for bound in self._action_bounds)
+        low, high = (bound.to(actions.device) for bound in self._action_bounds)
         fitting = actions.to(low.dtype).reshape(-1, *low.shape)
         return th.minimum(th.maximum(fitting, low), high) if self._can_exceed else fitting

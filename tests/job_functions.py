@@ -9,7 +9,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from sb3_knntd.distributed.jobs import stored_as
 
+
+@stored_as("job_functions.square")
 def square(number: int, log: str) -> dict[str, Any]:
     """Leave a line in the log for each time it is computed."""
     with open(log, "a") as file:
@@ -17,6 +20,7 @@ def square(number: int, log: str) -> dict[str, Any]:
     return {"square": number**2, "pair": (number, number)}
 
 
+@stored_as("job_functions.threads")
 def threads() -> dict[str, Any]:
     """How many threads libraries take, and who computes."""
     import torch
@@ -24,16 +28,19 @@ def threads() -> dict[str, Any]:
     return {"torch": torch.get_num_threads(), "openmp": os.environ["OMP_NUM_THREADS"], "process": os.getpid()}
 
 
+@stored_as("job_functions.fail")
 def fail(what: str) -> None:
     """Raise."""
     raise ValueError(f"there is no {what}")
 
 
+@stored_as("job_functions.unstorable")
 def unstorable() -> object:
     """What JSON cannot hold."""
     return object()
 
 
+@stored_as("job_functions.die")
 def die(marker: str, times: int) -> str:
     """Be killed so many times, then return."""
     path = Path(marker)
@@ -44,6 +51,7 @@ def die(marker: str, times: int) -> str:
     return f"alive after {attempts}"
 
 
+@stored_as("job_functions.slow")
 def slow(seconds: float, folder: str) -> int:
     """Tell which process is at it, and take some time."""
     Path(folder, f"started-{os.getpid()}").touch()
@@ -51,6 +59,7 @@ def slow(seconds: float, folder: str) -> int:
     return os.getpid()
 
 
+@stored_as("job_functions.die_while_answering")
 def die_while_answering(marker: str, times: int) -> str:
     """Be killed so many times in the middle of a large answer, then return it."""
     path = Path(marker)

@@ -19,8 +19,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd import KNNTD, cli
 from sb3_knntd.distributed.jobs import Job, Outcome
+from sb3_knntd.registry import ALGORITHMS
 from sb3_knntd.zoo.schedules import with_schedules
-from sb3_knntd.zoo.search_space import SAMPLERS, attributes
+from sb3_knntd.zoo.search_space import attributes
 
 ROOT = pathlib.Path(__file__).parent.parent
 
@@ -278,7 +279,7 @@ def test_a_second_look_is_at_the_best_trials_and_what_is_there(benchmarks: Any) 
     def objective(trial: optuna.Trial) -> float:
         for name, value in attributes(4, present).items():
             trial.set_user_attr(name, value)
-        SAMPLERS["knntd"](trial, 2, 1, {})
+        ALGORITHMS["knntd"].load_search_space().sample(trial, 2, 1, {})
         return [1.0, 3.0, 2.0][trial.number]
 
     study.optimize(objective, n_trials=3)

@@ -20,10 +20,11 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.monitor import load_results
 
-import sb3_knntd.cli
 import sb3_knntd.experiments.demo
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.cli import CommandError, main
+from sb3_knntd.cli import main
+from sb3_knntd.common import command_line
+from sb3_knntd.common.command_line import CommandError
 
 # SB3 silences it when it is imported, which pytest undoes.
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -281,9 +282,11 @@ def test_seed_must_be_one(seed: str, capsys: pytest.CaptureFixture[str]) -> None
 def test_missing_extra_packages_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    find_spec = sb3_knntd.cli.find_spec
+    find_spec = command_line.find_spec
     absent = {"tqdm", "matplotlib"}
-    monkeypatch.setattr(sb3_knntd.cli, "find_spec", lambda name: None if name in absent else find_spec(name))
+    monkeypatch.setattr(
+        sb3_knntd.common.command_line, "find_spec", lambda name: None if name in absent else find_spec(name)
+    )
     error = error_of(["demo", "--out", str(tmp_path / "out")], capsys)
     assert "tqdm and matplotlib" in error
     assert 'pip install "sb3-knntd[extra]"' in error

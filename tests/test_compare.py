@@ -6,11 +6,12 @@ import csv
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,13 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
-import sb3_knntd.cli
 from sb3_knntd import KNNTD
 from sb3_knntd.cli import main
-from sb3_knntd.distributed.jobs import Job, Outcome, run_jobs, run_locally
+from sb3_knntd.common import command_line
+from sb3_knntd.distributed.jobs import Event, Job, Outcome, run_jobs, run_locally
 from sb3_knntd.experiments.compare import statistics
 from sb3_knntd.experiments.compare.cautions import cautions
+from sb3_knntd.experiments.compare.command import Plan, make_job
 from sb3_knntd.experiments.compare.configurations import Configuration, configuration, fits, label
 from sb3_knntd.experiments.compare.experiment import experiment, prepare
 from sb3_knntd.experiments.compare.report import make_report
@@ -240,6 +242,41 @@ def test_points_closer_than_a_step_of_all_environments() -> None:
 # ------------------------------------------------------------- configurations
 
 
+RUNS = sorted((Path(__file__).parents[1] / "docs" / "comparison").glob("*/runs/*-1000-*.json"))
+
+
+def test_stored_runs_count_as_computed(tmp_path: Path) -> None:
+    """The runs behind docs/results.md were stored when the modules had other names."""
+    assert RUNS
+    jobs = []
+    for path in RUNS:
+        arguments = json.loads(path.read_text())["arguments"]
+        plan = Plan(
+            [arguments["env"]],
+            [arguments["algo"]],
+            range(1000, 1001),
+            arguments["steps"],
+            False,
+            {},
+            {},
+            arguments["eval_points"],
+            arguments["eval_episodes"],
+            arguments["packages"],
+            tmp_path,
+        )
+        job = make_job(plan, arguments["env"], arguments["algo"], 1000, arguments["hyperparams"])
+        assert job.key == path.stem
+        shutil.copyfile(path, tmp_path / path.name)
+        jobs.append(job)
+
+    def nothing(jobs: Sequence[Job]) -> Generator[Event, None, None]:
+        assert not jobs
+        yield from ()
+
+    outcomes = run_jobs(jobs, tmp_path, backend=nothing)
+    assert [outcomes[job.key].result for job in jobs] == [json.loads(path.read_text())["result"] for path in RUNS]
+
+
 def test_configurations_are_the_tuned_ones_or_the_defaults(tmp_path: Path) -> None:
     tuned = configuration("dqn", "MountainCar-v0", False, {})
     assert tuned.hyperparams["learning_rate"] == 4e-3
@@ -326,8 +363,8 @@ def test_a_configuration_that_cannot_be_built_is_told_of_at_once(
 
 
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    found = sb3_knntd.cli.find_spec
-    monkeypatch.setattr(sb3_knntd.cli, "find_spec", lambda name: None if name in ("rliable", "ray") else found(name))
+    found = command_line.find_spec
+    monkeypatch.setattr(command_line, "find_spec", lambda name: None if name in ("rliable", "ray") else found(name))
     with pytest.raises(SystemExit, match="2"):
         main(["compare", "--env", "CartPole-v1", "--algos", "knntd"])
     assert 'rliable not installed: pip install "sb3-knntd[compare]"' in capsys.readouterr().err

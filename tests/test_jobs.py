@@ -18,7 +18,7 @@ import pytest
 
 from sb3_knntd.common.files import replace_file
 from sb3_knntd.distributed import jobs as jobs_module
-from sb3_knntd.distributed.jobs import Job, Outcome, compute, run_jobs
+from sb3_knntd.distributed.jobs import Job, Outcome, compute, run_jobs, stored_as
 
 INTERRUPTIBLE = """
 import sys
@@ -53,6 +53,21 @@ def is_running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def test_results_stay_computed_when_their_function_moves(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    run_jobs(squares([3], log), tmp_path / "jobs")
+
+    def moved(number: int, log: str) -> None:
+        raise AssertionError("it is there")
+
+    job = squares([3], log)[0]._replace(function=stored_as("job_functions.square")(moved))
+    assert run_jobs([job], tmp_path / "jobs")[job.key] == Outcome({"square": 9, "pair": [3, 3]})
+    renamed = job._replace(function=stored_as("other_functions.square", "job_functions.square")(moved))
+    assert run_jobs([renamed], tmp_path / "jobs")[job.key] == Outcome({"square": 9, "pair": [3, 3]})
+    with pytest.raises(ValueError, match=r"wait_until must be decorated with stored_as\(name\)"):
+        run_jobs([Job("a", wait_until, {})], tmp_path / "jobs")
 
 
 def test_each_is_computed_once_for_its_arguments(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

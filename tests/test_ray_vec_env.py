@@ -38,7 +38,8 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_knntd import KNNTD, ExA, ray_vec_env
+from sb3_knntd import KNNTD, ExA
+from sb3_knntd.distributed import ray_vec_env
 from sb3_knntd.distributed.ray_vec_env import RayVecEnv
 
 #: Nothing is reserved: the tests' machine has few cores, and nobody else is on the cluster.

@@ -19,16 +19,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import sb3_knntd.cli
 from sb3_knntd import DeltaFilter
 from sb3_knntd.cli import main
+from sb3_knntd.common import command_line
 from sb3_knntd.experiments.reproduce import FIGURES
 from sb3_knntd.experiments.reproduce.curves import episode_lengths
 from sb3_knntd.experiments.reproduce.fig4 import SignalRecorder, at_wall, constant_error, ratio_off_wall
 from sb3_knntd.experiments.reproduce.fig6 import success
 from sb3_knntd.experiments.reproduce.fig7 import FullEpisodeRecorder, mean_change, used_share
-from sb3_knntd.experiments.reproduce.settings import ALGORITHMS, load_settings, make_model, total_steps
+from sb3_knntd.experiments.reproduce.settings import load_settings, make_model, total_steps
 from sb3_knntd.experiments.reproduce.statistics import interval, quantile
+from sb3_knntd.registry import ALGORITHMS
 
 PNG = b"\x89PNG\r\n\x1a\n"
 LEAST_PICTURE = 20_000
@@ -264,7 +265,7 @@ def test_figure_7(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_settings_make_models(figure: str, variant: str) -> None:
     for algorithm, setting in load_settings(figure).get(variant, {}).items():
         model = make_model(algorithm, setting, 0, lambda env: env)
-        assert type(model) is ALGORITHMS[algorithm]
+        assert type(model) is ALGORITHMS[algorithm].load()
         assert model.n_neighbors == setting["n_neighbors"]
         assert model.gamma == setting["gamma"]
         assert total_steps(setting) == 1000 * setting["episodes"]
@@ -388,8 +389,8 @@ def test_out_must_be_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_missing_extra_packages_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    find_spec = sb3_knntd.cli.find_spec
-    monkeypatch.setattr(sb3_knntd.cli, "find_spec", lambda name: None if name == "tqdm" else find_spec(name))
+    find_spec = command_line.find_spec
+    monkeypatch.setattr(command_line, "find_spec", lambda name: None if name == "tqdm" else find_spec(name))
     with pytest.raises(SystemExit):
         main(["reproduce", "fig3", "--out", str(tmp_path / "out")])
     assert 'tqdm not installed: pip install "sb3-knntd[extra]"' in capsys.readouterr().err

@@ -27,14 +27,15 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.utils import LinearSchedule
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import sb3_knntd.cli
-from sb3_knntd import KNNTD, ExA
-from sb3_knntd.cli import CommandError, main
+from sb3_knntd import KNNTD, ExA, registry
+from sb3_knntd.cli import main
+from sb3_knntd.common import command_line
+from sb3_knntd.common.command_line import CommandError
 from sb3_knntd.common.schedules import parse_schedule
 from sb3_knntd.zoo import experiment, register
 from sb3_knntd.zoo.configuration_first import ConfigurationFirst
 from sb3_knntd.zoo.schedules import with_schedules
-from sb3_knntd.zoo.search_space import CONVERTERS, OBS_DIM, SAMPLERS, attributes, study_values
+from sb3_knntd.zoo.search_space import OBS_DIM, SearchSpace, attributes, study_values
 
 # SB3 silences the one when it is imported, which pytest undoes; the other is RL Zoo's word on an unnamed study.
 pytestmark = [
@@ -43,6 +44,15 @@ pytestmark = [
 ]
 
 ALGORITHMS = {"knntd": KNNTD, "exa": ExA}
+
+
+def search_space(algo: str) -> SearchSpace:
+    """What a study searches for an algorithm."""
+    space = registry.ALGORITHMS[algo].load_search_space()
+    assert isinstance(space, SearchSpace)
+    return space
+
+
 ENVS = {"knntd": "MountainCar-v0", "exa": "Pendulum-v1"}
 #: Other points than the configurations have.
 POINTS = {"knntd": [8, 7], "exa": [5, 4, 3]}
@@ -313,13 +323,13 @@ def ends(distribution: Any) -> tuple[Any, Any]:
 @pytest.mark.parametrize("obs_dim", [0, 1, 2, 4, 6, 17])
 def test_search_space(algo: str, obs_dim: int) -> None:
     trial = asked(obs_dim, {})
-    SAMPLERS[algo](trial, 0, 1, {})
+    search_space(algo).sample(trial, 0, 1, {})
     assert ("points_per_dimension" in trial.params) == (obs_dim > 0)
     # The corners of what is searched, and what was drawn.
     distributions = trial.distributions.items()
     for params in (trial.params, *({name: ends(d)[end] for name, d in distributions} for end in (0, 1))):
-        arguments = SAMPLERS[algo](with_attributes(optuna.trial.FixedTrial(params), obs_dim, {}), 0, 1, {})
-        converted = CONVERTERS[algo](json.loads(json.dumps(params)))
+        arguments = search_space(algo).sample(with_attributes(optuna.trial.FixedTrial(params), obs_dim, {}), 0, 1, {})
+        converted = search_space(algo).convert(json.loads(json.dumps(params)))
         assert json.loads(json.dumps(converted)) == converted
         assert arguments.keys() == converted.keys()
         assert all(callable(value) or converted[name] == value for name, value in arguments.items())
@@ -340,20 +350,20 @@ def test_search_space(algo: str, obs_dim: int) -> None:
 def test_a_study_keeps_the_points_of_each_dimension(algo: str, points: list[Any], most_neighbors: int) -> None:
     configuration = {"points": points, "action_points": [[-1.0, 1.0], [-1.0, 0.0, 1.0]]}
     trial = asked(2, configuration)
-    arguments = SAMPLERS[algo](trial, 0, 1, {})
+    arguments = search_space(algo).sample(trial, 0, 1, {})
     assert not {"points", "action_points"} & arguments.keys()
     assert trial.distributions["n_neighbors"].high == most_neighbors
     assert arguments["bandwidth"] == trial.params["bandwidth"]
     # One number for all dimensions is no such knowledge.
-    assert {"points"} < SAMPLERS[algo](asked(2, {"points": 5, "action_points": 3}), 0, 1, {}).keys()
+    assert {"points"} < search_space(algo).sample(asked(2, {"points": 5, "action_points": 3}), 0, 1, {}).keys()
 
 
 @pytest.mark.parametrize("algo", ["knntd", "exa"])
 @pytest.mark.parametrize("given", [{}, {"points": [5, 6]}])
 def test_the_first_trial_is_the_configurations(algo: str, given: dict[str, Any]) -> None:
-    configuration = given | SAMPLERS[algo](asked(2, given), 0, 1, {})
+    configuration = given | search_space(algo).sample(asked(2, given), 0, 1, {})
     first = ConfigurationFirst(RandomSampler(seed=1), study_values(ALGORITHMS[algo], configuration))
-    arguments = given | SAMPLERS[algo](asked(2, given, first), 0, 1, {})
+    arguments = given | search_space(algo).sample(asked(2, given, first), 0, 1, {})
     assert arguments.keys() == configuration.keys()
     for name, value in arguments.items():
         if isinstance(value, LinearSchedule):
@@ -369,7 +379,7 @@ def test_the_first_trial_where_the_configuration_is_not_in_the_search_space() ->
     study = optuna.create_study(sampler=ConfigurationFirst(RandomSampler(seed=0), study_values(KNNTD, settings)))
     first, second = (with_attributes(study.ask(), 2, settings) for _ in range(2))
     for trial in (first, second):
-        SAMPLERS["knntd"](trial, 0, 1, {})
+        search_space("knntd").sample(trial, 0, 1, {})
     assert (first.params["initial_learning_rate"], first.params["final_learning_rate_share"]) == (0.4, 1.0)
     assert (first.params["one_minus_gamma"], first.params["exploration_initial_eps"]) == (0.0001, 0.001)
     assert (first.params["target"], first.params["exploration_fraction"]) == ("sarsa", 0.5)
@@ -600,8 +610,8 @@ def test_module_lists_its_commands() -> None:
 
 
 def test_without_rl_zoo(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    found = sb3_knntd.cli.find_spec
-    monkeypatch.setattr(sb3_knntd.cli, "find_spec", lambda name: None if name == "rl_zoo3" else found(name))
+    found = command_line.find_spec
+    monkeypatch.setattr(command_line, "find_spec", lambda name: None if name == "rl_zoo3" else found(name))
     with pytest.raises(SystemExit) as stopped:
         main(["train", "--algo", "knntd"])
     assert stopped.value.code == 2

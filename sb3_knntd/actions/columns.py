@@ -32,6 +32,14 @@ class ActionColumns(NamedTuple):
     lists: list[np.ndarray]
 
 
+def discrete_columns(n_actions: int) -> ActionColumns:
+    """
+    :param n_actions: number of actions
+    :return: a column for each
+    """
+    return ActionColumns(np.empty((n_actions, 0)), np.array([0, n_actions]), [])
+
+
 def make_action_columns(action_space: spaces.Box, action_points: Any, action_table: str | None) -> ActionColumns:
     """
     :param action_space: Box with finite bounds

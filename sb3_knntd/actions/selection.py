@@ -266,8 +266,8 @@ class MeanValueSelector(ActionSelector):
 
 class MeanActionSelector(ActionSelector):
     """
-    Ex⟨a⟩: each neighbour selects the best action of its own row, and the mean of these actions is taken (eqs. 19 to 21).
-    The state is worth the mean of the neighbours' best values (eq. 25).
+    Ex⟨a⟩: each neighbour selects the best action of its own row, and the mean of these actions is taken (eqs. 19 to
+    21). The state is worth the mean of the neighbours' best values (eq. 25).
 
     :param columns: the action points, in columns for each action factor
     :param exploration: ``SHARED``: all neighbours explore the same column; ``PER_NEIGHBOR``: each by itself (eq. 27)
@@ -337,9 +337,7 @@ class MeanActionSelector(ActionSelector):
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
         vectors, points = np.asarray(actions, dtype=np.float64), self.columns.points
         if vectors.ndim != 2 or vectors.shape[1] != points.shape[1] or not np.isfinite(vectors).all():
-            raise ValueError(
-                f"actions must be finite and of shape (n, {points.shape[1]}); got shape {vectors.shape}"
-            )
+            raise ValueError(f"actions must be finite and of shape (n, {points.shape[1]}); got shape {vectors.shape}")
         nearest = []
         for factor, (first, end) in enumerate(self.factor_ranges):
             # A factored table has a factor for each dimension of the action.

@@ -6,8 +6,8 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from decimal import Decimal
-from pathlib import Path
 from enum import Enum
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -140,6 +140,20 @@ def check_numbers(name: str, value: Any) -> np.ndarray:
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name} must be an array of numbers; got {shown(value)}")
     return array.astype(np.float64)
+
+
+def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
+    """
+    :param what: what the values are
+    :param values: a row for each of ``envs``
+    :param envs: the environments that returned them
+    :raises ValueError: if a value is not finite; the message says where
+    """
+    finite = np.isfinite(values)
+    if not finite.all():
+        row, *component = np.argwhere(~finite)[0].tolist()
+        where = f" in component {component[0]}" if component else ""
+        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
 
 
 def check_schedule(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import isfinite
 from typing import Any
 
 import numpy as np
+
+from sb3_knntd.common.checks import check_finite
 
 #: Types of numbers, as NumPy abbreviates them: truth values, integers and floats.
 NUMBERS = "biuf"
@@ -101,20 +102,6 @@ def _first_odd_row(array: np.ndarray, shape: tuple[int, ...]) -> str:
     if array.ndim and array.shape[1:] != shape[1:]:
         return ", from environment 0 on"
     return ""
-
-
-def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
-    """
-    :param what: what the values are
-    :param values: a row for each of ``envs``
-    :param envs: the environments that returned them
-    :raises ValueError: if a value is not finite; the message says where
-    """
-    finite = np.isfinite(values)
-    if not finite.all():
-        row, *component = np.argwhere(~finite)[0].tolist()
-        where = f" in component {component[0]}" if component else ""
-        raise ValueError(f"environment {envs[row]} returned {what} that is not finite{where}: {values[row]}")
 
 
 def check_transition(observations: np.ndarray, rewards: np.ndarray) -> None:

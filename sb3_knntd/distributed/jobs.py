@@ -21,7 +21,7 @@ from contextlib import closing, contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -33,6 +33,8 @@ ONE_THREAD = {
 }
 #: What is locked in a folder where jobs are computed.
 LOCK = ".lock"
+#: Attribute of a function: the names that :func:`stored_as` was given.
+_NAMES = "_stored_as"
 #: How often a job is begun whose worker process dies.
 ATTEMPTS = 2
 #: Where there is no terminal, progress is told in so many lines, and when so many seconds have passed since the last.
@@ -40,12 +42,33 @@ PROGRESS_LINES = 10
 PROGRESS_SECONDS = 60.0
 
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def stored_as(name: str, *earlier: str) -> Callable[[Function], Function]:
+    """
+    Decorate a function that computes jobs. Files of results name the function, and a result counts as computed only
+    under this name; so it stays the same when the function moves to another module, and changes when the function
+    computes something else.
+
+    :param name: what its results are stored under
+    :param earlier: what they were stored under before; such results still count
+    :return: the decorator, which returns the function itself
+    """
+
+    def mark(function: Function) -> Function:
+        function.__dict__[_NAMES] = (name, *earlier)
+        return function
+
+    return mark
+
+
 class Job(NamedTuple):
     """
     Something to compute.
 
     :param key: its name, and that of its file: letters, digits, ``_`` and ``-``
-    :param function: what computes it, a function that can be imported by its name
+    :param function: what computes it, a function that can be imported by its name, decorated with :func:`stored_as`
     :param arguments: keyword arguments, of what JSON can hold
     :param fits: whether something that is read from a file can be its result, a function that can be imported by its
         name; by default anything can
@@ -80,9 +103,9 @@ def run_jobs(
     """
     Compute what is not yet in the folder, several jobs at a time, with a progress bar on standard error.
 
-    The outcome of each job is stored when it is there, as ``key.json``. A result that was computed by the same function
-    from the same arguments is taken from its file; all else is computed, failures anew. Whatever ends the program, the
-    files that are there are whole, and the next call goes on from them.
+    The outcome of each job is stored as ``key.json`` as soon as there is one. A result that was computed by the same
+    function (:func:`stored_as`) from the same arguments is read from its file; everything else is computed, also what
+    failed before. Whatever ends the program, all files are complete, and the next call continues from them.
 
     :param jobs: what to compute, keys all different
     :param folder: where outcomes are; made if it is not there
@@ -90,7 +113,7 @@ def run_jobs(
     :param title: what the progress is of
     :param backend: what computes them; by default so many processes of this machine
     :return: the outcome of each job, by key, in the order of ``jobs``
-    :raises ValueError: if a key is no file name or there twice, or ``workers`` < 1
+    :raises ValueError: if a key is no file name or there twice, a function has no :func:`stored_as`, or ``workers`` < 1
     :raises TypeError: if JSON cannot hold the arguments of a job
     :raises OSError: if the folder cannot be written to, or another process computes there
     """
@@ -128,7 +151,7 @@ def _run_jobs(
     outcomes = {
         job.key: outcome
         for job in jobs
-        if (outcome := _stored_outcome(folder / f"{job.key}.json", descriptions[job.key], job.fits))
+        if (outcome := _stored_outcome(folder / f"{job.key}.json", descriptions[job.key], job))
     }
     missing = [job for job in jobs if job.key not in outcomes]
     events = run_locally(missing, workers or usable_cores()) if backend is None else backend(missing)
@@ -220,12 +243,20 @@ def _description(job: Job) -> dict[str, Any]:
     """What its outcome depends on, as JSON gives it back."""
     if not job.key or not all(character.isalnum() or character in "_-" for character in job.key):
         raise ValueError(f"a key must be letters, digits, '_' and '-'; got {job.key!r}")
-    name = f"{job.function.__module__}.{job.function.__qualname__}"
+    name = _names(job.function)[0]
     description: dict[str, Any] = json.loads(json.dumps({"function": name, "arguments": job.arguments}))
     return description
 
 
-def _stored_outcome(path: Path, description: dict[str, Any], fits: Callable[[Any], bool] | None) -> Outcome | None:
+def _names(function: Callable[..., Any]) -> tuple[str, ...]:
+    """What results of a function are stored under, and were before."""
+    names: tuple[str, ...] = getattr(function, _NAMES, ())
+    if not names:
+        raise ValueError(f"{function.__qualname__} must be decorated with stored_as(name) to compute jobs")
+    return names
+
+
+def _stored_outcome(path: Path, description: dict[str, Any], job: Job) -> Outcome | None:
     """The result in a file, if it is there and of just this job."""
     try:
         stored = json.loads(path.read_bytes())
@@ -237,9 +268,10 @@ def _stored_outcome(path: Path, description: dict[str, Any], fits: Callable[[Any
         return None
     if isinstance(stored, dict) and "result" in stored:
         result = stored.pop("result")
-        if stored != description:
+        is_same = stored.get("function") in _names(job.function)
+        if not is_same or stored | {"function": description["function"]} != description:
             return None
-        if fits is None or fits(result):
+        if job.fits is None or job.fits(result):
             return Outcome(result)
     print(f"{path} is damaged, and its job is computed anew", file=sys.stderr)
     return None

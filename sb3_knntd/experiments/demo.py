@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
 import signal
@@ -18,15 +19,16 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_knntd.cli import CommandError, make_env
+from sb3_knntd.common.command_line import INTERRUPTED, CommandError, make_env, positive_int, require, seed_int
 from sb3_knntd.common.files import replacing
-from sb3_knntd.exa import ExA
 from sb3_knntd.experiments.baselines.random_agent import RandomPolicy
-from sb3_knntd.knntd import KNNTD
 from sb3_knntd.plots import figure_of, plot_learning_curve, plot_value_function, telling_dims
+from sb3_knntd.registry import for_actions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from sb3_knntd.common.command_line import Subparsers
 
 EVAL_EPISODES = 100
 #: Predicting for several environments at once takes hardly longer than for one.
@@ -35,6 +37,32 @@ EVAL_ENVS = 20
 EVAL_STEP_LIMIT = 1000
 #: So that evaluation does not start where training did.
 EVAL_SEED_OFFSET = 1000
+
+
+def add_demo(subparsers: Subparsers) -> None:
+    """
+    :param subparsers: where to add the command
+    """
+    parser = subparsers.add_parser(
+        "demo",
+        help="train on an environment and show what was learned",
+        description="Train KNNTD, or ExA where actions are continuous, on an environment, save and reload the model, "
+        "evaluate it beside a random policy, and draw its learning curve and value function.",
+    )
+    parser.add_argument("--env", default="MountainCar-v0", metavar="ID", help="gymnasium id (default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=positive_int, default=50_000, metavar="N", help="environment steps (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=seed_int, default=0, metavar="N", help="random seed (default: %(default)s)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for all files (default: %(default)s)"
+    )
+    parser.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    require("tqdm", "rich", "tensorboard", "matplotlib")
+    return 0 if demo(args.env, args.steps, args.seed, args.out) else INTERRUPTED
 
 
 class StopOnInterrupt:
@@ -75,7 +103,7 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
         folder that can be written to
     """
     env = make_env(env_id)
-    algorithm: type[KNNTD | ExA] = ExA if isinstance(env.action_space, spaces.Box) else KNNTD
+    algorithm = for_actions(env.action_space).load()
     name = algorithm.__name__
     try:
         # Before the first file is written: an environment that is refused must not cost an earlier demo's files.

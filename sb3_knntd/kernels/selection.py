@@ -219,9 +219,7 @@ def select(indices, probabilities, uniforms, rate, persistent, state, action_ind
     if state.combination == Combination.OF_VALUES:
         return _select_from_mean(indices, probabilities, uniforms, rate, state, action_indices)
     if state.combination == Combination.OF_ACTIONS:
-        return _select_from_each(
-            indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action
-        )
+        return _select_from_each(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action)
     raise ValueError("the kernels do not know this combination")
 
 
@@ -256,8 +254,8 @@ def greedy_and_given_value(indices, probabilities, columns, state):
 def persist(uniforms, rate, lengths, env, selection, persistent):
     """
     Keep what is being explored, or draw anew whether to explore and what. On average a draw is kept for
-    ``min_persistence`` steps, or for ``persistence_share`` of an episode if that is longer. An episode is taken to be as
-    long as the mean one, or as this one is already.
+    ``min_persistence`` steps, or for ``persistence_share`` of an episode if that is longer. An episode is taken to be
+    as long as the mean one, or as this one is already.
 
     :param uniforms: random numbers in [0, 1), of which the first 2 + n_factors are used
     :param rate: ε, the share of draws that explore

@@ -1,9 +1,9 @@
 """
 All arrays and numbers that a learning step works on, as one object for compiled functions.
 
-To take in one object costs numba a microsecond, to take in its arrays one by one several. Its fields are the named tuples
-that the kernels declare beside their functions: a new array is a line in one of them, and its value is given by name
-where that tuple is made.
+To take in one object costs numba a microsecond, to take in its arrays one by one several. Its fields are the named
+tuples that the kernels declare beside their functions: a new array is a line in one of them, and its value is given by
+name where that tuple is made.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from sb3_knntd.kernels.jit import AVAILABLE, jit
 from sb3_knntd.kernels.perceive import PerceptionArguments
 from sb3_knntd.kernels.selection import SelectionArguments
 from sb3_knntd.kernels.traces import TableArrays, TraceArrays
+
 
 class UpdateConfig(NamedTuple):
     """

@@ -36,9 +36,9 @@ from sb3_knntd.kernels.traces import (
 CURRENT, NEXT, TERMINAL = 0, 1, 2
 
 
-#: Outcomes of a step: done; more random numbers or more rows are needed; a rate is out of range, or what the environments
-#: returned is not finite, or values would become too large. Plain numbers: an enumeration's member takes half a
-#: microsecond to hand back.
+#: Outcomes of a step: done; more random numbers or more rows are needed; a rate is out of range, or what the
+#: environments returned is not finite, or values would become too large. Plain numbers: an enumeration's member takes
+#: half a microsecond to hand back.
 OK, NEED_RANDOM, NEED_CAPACITY, BAD_RATE, NOT_FINITE, DIVERGED = range(6)
 
 
@@ -101,8 +101,8 @@ def _stay_small(change, trace_decay, state):
 @inlined
 def update_table(state, target_values, rewards, ended, learning_rate, trace_decay):
     """
-    Compute the TD errors of the steps from the ``CURRENT`` states, and credit them along the traces (Algorithm 3), in all
-    environments at once: every value is read before any is changed.
+    Compute the TD errors of the steps from the ``CURRENT`` states, and credit them along the traces (Algorithm 3), in
+    all environments at once: every value is read before any is changed.
 
     :param state: see :mod:`sb3_knntd.kernels.state`
     :param target_values: values of the states that the steps led to, 0 where an episode was terminated, shape (n_envs,)

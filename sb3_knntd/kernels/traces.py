@@ -139,8 +139,8 @@ def read_row(point, values, row_slots, initial_value, entries, slots, clock, row
     """
     Write the values of a point into ``row``, shape (n_actions,).
 
-    The arrays are those of :class:`TableArrays` and :class:`TraceArrays`, taken out once before a loop over points: numba
-    counts references to an array each time it is.
+    The arrays are those of :class:`TableArrays` and :class:`TraceArrays`, taken out once before a loop over points:
+    numba counts references to an array each time it is.
     """
     place = find(point, slots)
     if place >= 0:

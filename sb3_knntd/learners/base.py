@@ -74,8 +74,8 @@ class Transitions(NamedTuple):
     :param rewards: shape (n,)
     :param next_observations: what the steps led to, before a reset, shape (n, *obs_shape)
     :param terminated: whether the next state is terminal, and worth nothing, shape (n,), bool
-    :param ended: whether the next transition does not go on from this one: at the end of an episode, at a truncation, or
-        everywhere for single steps, shape (n,), bool
+    :param ended: whether the next transition does not go on from this one: at the end of an episode, at a truncation,
+        or everywhere for single steps, shape (n,), bool
     """
 
     observations: np.ndarray

@@ -10,7 +10,8 @@ import torch as th
 
 from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.random_stream import RandomStream
-from sb3_knntd.common.transitions import check_finite, check_transition
+from sb3_knntd.common.checks import check_finite
+from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels import td
 from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination, SelectionArguments
 from sb3_knntd.kernels.state import EpisodeArrays, RandomRows, UpdateConfig, WorkArrays, make_state
@@ -309,7 +310,8 @@ class CompiledLearner(Learner):
         with self.table.lock:
             return {
                 "indices": th.from_numpy(episodes.indices[td.CURRENT].copy()),
-                "probabilities": th.from_numpy(episodes.probabilities[td.CURRENT].copy()),
+                # None while there are no episodes: a state without them is one that has not begun.
+                "probabilities": th.from_numpy(episodes.probabilities[td.CURRENT] * self.in_episodes),
                 "entries": th.from_numpy(episodes.action_indices[td.CURRENT].copy()),
                 "held": th.from_numpy(episodes.persistent.copy()),
                 "lengths": th.from_numpy(episodes.lengths.copy()),

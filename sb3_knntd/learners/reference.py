@@ -10,7 +10,8 @@ import torch as th
 
 from sb3_knntd.actions.selection import ActionSelector, Selection
 from sb3_knntd.common.random_stream import RandomStream
-from sb3_knntd.common.transitions import check_finite, check_transition
+from sb3_knntd.common.checks import check_finite
+from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels.selection import UNDRAWN, count_steps
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE
@@ -212,7 +213,8 @@ class TorchLearner(Learner):
     def state_dict(self) -> dict[str, Any]:
         return {
             "indices": self.indices.cpu(),
-            "probabilities": self.probabilities.double().cpu(),
+            # None while there are no episodes: a state without them is one that has not begun.
+            "probabilities": self.probabilities.double().cpu() * self.in_episodes,
             "entries": self.action_indices.cpu(),
             "held": self.persistent.cpu(),
             "lengths": th.from_numpy(self.lengths.copy()),

@@ -34,8 +34,8 @@ class QTable(nn.Module, ABC):
     What every table does.
 
     Its entries can be read from any thread at any time, also while a learner works: both hold :attr:`lock`. Values of
-    the points that have an eligibility trace are kept in :attr:`traces` until the trace has decayed, and everything that
-    reads the table here takes them from there.
+    the points that have an eligibility trace are kept in :attr:`traces` until the trace has decayed, and everything
+    that reads the table here takes them from there.
 
     :param n_actions: number of columns
     :param initial_value: what every entry is at the start

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 
-from sb3_knntd.cli import add_zoo, main
+from sb3_knntd.common.command_line import run_commands
+from sb3_knntd.zoo.parser import add_zoo
 
 if __name__ == "__main__":
-    sys.exit(main(prog="python -m sb3_knntd.zoo", commands=(add_zoo,)))
+    sys.exit(run_commands((add_zoo,), prog="python -m sb3_knntd.zoo"))

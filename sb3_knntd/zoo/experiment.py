@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from importlib.resources import files
 from typing import Any
 
 import optuna
@@ -15,12 +14,10 @@ from sqlalchemy.exc import DBAPIError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd.registry import Role, with_role
 from sb3_knntd.zoo.configuration_first import ConfigurationFirst
 from sb3_knntd.zoo.schedules import with_schedules
 from sb3_knntd.zoo.search_space import attributes, study_values
-
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"knntd": KNNTD, "exa": ExA}
 
 #: What a table and its traces are made for. As with a network's architecture, training goes on with what the saved
 #: model has.
@@ -50,17 +47,17 @@ class KNNExperimentManager(ExperimentManager):
     """
 
     def __init__(self, args: argparse.Namespace, algo: str, *arguments: Any, **options: Any) -> None:
-        self._is_ours = algo in ALGORITHMS
+        self._own = with_role(Role.OWN).get(algo)
         self.obs_dim = 0
-        if self._is_ours:
-            options["config"] = options.get("config") or str(files("sb3_knntd.zoo_configs") / f"{algo}.yml")
+        if self._own:
+            options["config"] = options.get("config") or str(self._own.config_path)
             if options.get("device", "auto") == "auto":
                 options["device"] = "cpu"
         super().__init__(args, algo, *arguments, **options)
 
     # RL Zoo's is a static method; which schedules there are depends on the algorithm.
     def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
-        return with_schedules(hyperparams) if self._is_ours else super()._preprocess_schedules(hyperparams)
+        return with_schedules(hyperparams) if self._own else super()._preprocess_schedules(hyperparams)
 
     def _preprocess_action_noise(
         self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
@@ -71,7 +68,7 @@ class KNNExperimentManager(ExperimentManager):
         return super()._preprocess_action_noise(hyperparams, saved_hyperparams, env)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
-        if self._is_ours:
+        if self._own:
             given = [name for name in SHAPE if name in (self.custom_hyperparams or {})]
             if given:
                 raise ValueError(
@@ -83,9 +80,9 @@ class KNNExperimentManager(ExperimentManager):
 
     def _create_sampler(self, sampler_method: str) -> BaseSampler:
         sampler = super()._create_sampler(sampler_method)
-        if not self._is_ours:
+        if not self._own:
             return sampler
-        return ConfigurationFirst(sampler, study_values(ALGORITHMS[self.algo], self._hyperparams))
+        return ConfigurationFirst(sampler, study_values(self._own.load(), self._hyperparams))
 
     def hyperparameters_optimization(self) -> None:
         """Search hyperparameters, alone or as one of several workers on a study."""
@@ -99,7 +96,7 @@ class KNNExperimentManager(ExperimentManager):
         :return: mean return of the last evaluation
         :raises optuna.TrialPruned: if others were better so far, or action values diverge
         """
-        if not self._is_ours:
+        if not self._own:
             return super().objective(trial)
         for name, value in attributes(self.obs_dim, self._hyperparams).items():
             trial.set_user_attr(name, value)

@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+from sb3_knntd.registry import Role, with_role
+
 
 class Script(NamedTuple):
     """
@@ -45,8 +47,8 @@ SCRIPTS = {
 
 def register() -> None:
     """
-    Make ``knntd`` and ``exa``, their configurations and search spaces, and the environments of this package known to
-    RL Zoo in this process.
+    Make this package's own algorithms, their configurations and search spaces, and its environments known to RL Zoo in
+    this process.
 
     :raises ModuleNotFoundError: if RL Zoo is not installed
     """
@@ -56,13 +58,14 @@ def register() -> None:
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
     import sb3_knntd.envs  # noqa: F401
-    from sb3_knntd.zoo.experiment import ALGORITHMS, KNNExperimentManager
-    from sb3_knntd.zoo.search_space import CONVERTERS, SAMPLERS
+    from sb3_knntd.zoo.experiment import KNNExperimentManager
 
     # All of RL Zoo's modules share these tables.
-    rl_zoo3.ALGOS.update(ALGORITHMS)
-    HYPERPARAMS_SAMPLER.update(SAMPLERS)
-    HYPERPARAMS_CONVERTER.update(CONVERTERS)
+    for name, algorithm in with_role(Role.OWN).items():
+        rl_zoo3.ALGOS[name] = algorithm.load()
+        search_space = algorithm.load_search_space()
+        HYPERPARAMS_SAMPLER[name] = search_space.sample
+        HYPERPARAMS_CONVERTER[name] = search_space.convert
     rl_zoo3.train.ExperimentManager = KNNExperimentManager  # type: ignore[attr-defined]
 
 
@@ -95,7 +98,7 @@ def _errors_in_one_line() -> Iterator[None]:
     """RL Zoo's parsers report mistakes as this package's do, and also those in NAME:VALUE, which they evaluate."""
     from rl_zoo3.utils import StoreDict
 
-    from sb3_knntd.cli import Parser
+    from sb3_knntd.common.command_line import Parser
 
     report, store = argparse.ArgumentParser.error, StoreDict.__call__
 

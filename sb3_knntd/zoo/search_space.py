@@ -13,7 +13,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import optuna
@@ -24,6 +24,19 @@ from sb3_knntd.zoo.schedules import with_schedules
 
 Params = dict[str, Any]
 Sampler = Callable[[optuna.Trial, int, int, dict[str, Any]], Params]
+
+
+class SearchSpace(NamedTuple):
+    """
+    What is searched for an algorithm.
+
+    :param sample: from a trial with the :func:`attributes` to arguments of the algorithm
+    :param convert: from values of a study to arguments as a configuration has them
+    """
+
+    sample: Sampler
+    convert: Callable[[Params], Params]
+
 
 #: Attribute of a trial: number of observation dimensions, 0 for finite states, which have no lattice.
 OBS_DIM = "obs_dim"
@@ -199,5 +212,5 @@ def _arguments(trial: optuna.Trial, params: Params) -> Params:
     return with_schedules(params)
 
 
-SAMPLERS: dict[str, Sampler] = {"knntd": sample_knntd_params, "exa": sample_exa_params}
-CONVERTERS: dict[str, Callable[[Params], Params]] = {"knntd": convert_knntd_params, "exa": convert_exa_params}
+KNNTD_SEARCH_SPACE = SearchSpace(sample_knntd_params, convert_knntd_params)
+EXA_SEARCH_SPACE = SearchSpace(sample_exa_params, convert_exa_params)

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
 
-from sb3_knntd.experiments.baselines.stepwise import StepwiseAlgorithm
+from sb3_knntd.online_algorithm import OnlineAlgorithm
 
 
 class RandomPolicy(BasePolicy):
@@ -33,7 +33,7 @@ class RandomPolicy(BasePolicy):
         return np.stack([np.asarray(self.action_space.sample()) for _ in range(n_envs)])
 
 
-class RandomAgent(StepwiseAlgorithm):
+class RandomAgent(OnlineAlgorithm):
     """
     Acts at random and learns nothing.
 
@@ -79,6 +79,10 @@ class RandomAgent(StepwiseAlgorithm):
     def _setup_model(self) -> None:
         self.set_random_seed(self.seed)
         self.policy = RandomPolicy(self.observation_space, self.action_space)
+
+    def _checks_steps(self) -> bool:
+        # Observations may be of any kind.
+        return False
 
     def _act(self) -> np.ndarray:
         return self.policy.draw(self.n_envs)

@@ -12,9 +12,9 @@ from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_knntd.common.checks import check_integer, check_number, check_schedule
-from sb3_knntd.experiments.baselines.stepwise import StepwiseAlgorithm
 from sb3_knntd.experiments.baselines.tile_coding import TileCoder
 from sb3_knntd.kernels.jit import jit
+from sb3_knntd.online_algorithm import OnlineAlgorithm
 from sb3_knntd.perception.bounds import MEASURING_STEPS, make_bounds
 
 #: A trace that has decayed below this is forgotten.
@@ -93,7 +93,7 @@ class Traces(NamedTuple):
     n_listed: np.ndarray
 
 
-class TileSarsa(StepwiseAlgorithm):
+class TileSarsa(OnlineAlgorithm):
     """
     True online SARSA(λ) (van Seijen et al., JMLR 17, 2016; Sutton and Barto, 2nd ed., section 12.7) with tile coding,
     ε-greedy, for one environment with a Box of observations and Discrete actions.
@@ -207,6 +207,12 @@ class TileSarsa(StepwiseAlgorithm):
         assert isinstance(self.action_space, spaces.Discrete)
         return np.array([self._last_action + self.action_space.start])
 
+    def _abandon_episodes(self) -> None:
+        # Before the model is set up there is none.
+        if self._last_features is not None:
+            forget(self._traces.slots, self._traces.features, self._traces.n_listed)
+            self._q_old, self._last_features = 0.0, None
+
     def _choose(self, features: np.ndarray) -> int:
         """ε-greedy, ties at random; random while the range of the observations is being measured."""
         measuring = self.num_timesteps < self._measuring_steps
@@ -241,8 +247,7 @@ class TileSarsa(StepwiseAlgorithm):
             self.trace_decay,
         )
         if done:
-            forget(self._traces.slots, self._traces.features, self._traces.n_listed)
-            self._q_old, self._last_features = 0.0, None
+            self._abandon_episodes()
         else:
             self._last_features, self._last_action = features, action
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import rl_zoo3
 
-from sb3_knntd.cli import CommandError, make_env, reason_of
+from sb3_knntd.common.command_line import CommandError, make_env, reason_of
 from sb3_knntd.common.files import replace_file
 from sb3_knntd.distributed.jobs import Backend, Job, Outcome, run_jobs, run_locally, usable_cores
 from sb3_knntd.experiments.compare.configurations import FLOOR, Configuration, configuration, fits, label

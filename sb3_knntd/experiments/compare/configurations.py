@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,22 +13,17 @@ import yaml
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
-#: Algorithms of this project, in the order in which they are shown.
-OURS = ("knntd", "exa")
-#: Those whose configurations this package has.
-PACKAGED = (*OURS, "sarsa")
-#: Always there.
-FLOOR = "random"
+from sb3_knntd.registry import ALGORITHMS, Role, with_role
 
-#: What algorithms are called in tables and pictures; others by their names in capitals.
-LABELS = {"knntd": "kNN-TD(λ)", "exa": "Ex⟨a⟩(λ)", "sarsa": "SARSA(λ), tiles", "random": "random", "qrdqn": "QR-DQN"}
-#: The only policy that they have.
-POLICIES = {"knntd": "KNNPolicy", "exa": "KNNPolicy", "sarsa": "TilePolicy", "random": "RandomPolicy"}
-#: The actions that they can take; all others of RL Zoo take both.
-ACTIONS: dict[str, type[spaces.Space[Any]]] = {
-    **dict.fromkeys(("knntd", "sarsa", "dqn", "qrdqn"), spaces.Discrete),
-    **dict.fromkeys(("exa", "sac", "td3", "tqc", "ddpg", "crossq"), spaces.Box),
+#: The algorithm of every comparison that the others should do better than.
+(FLOOR,) = with_role(Role.FLOOR)
+#: RL Zoo's algorithms that take only one type of actions; its others take all.
+BASELINES: dict[str, type[spaces.Space[Any]]] = {
+    **dict.fromkeys(("dqn", "qrdqn"), spaces.Discrete),
+    **dict.fromkeys(("sac", "td3", "tqc", "ddpg", "crossq"), spaces.Box),
 }
+#: Those of RL Zoo's that are not shown by their names in capitals.
+BASELINE_LABELS = {"qrdqn": "QR-DQN"}
 #: Problems of gymnasium that environments of this package are forms of: what was tuned for those is good for these.
 RELATED = {
     "sb3_knntd/MountainCar-v0": "MountainCar-v0",
@@ -58,7 +52,17 @@ def label(algo: str) -> str:
     :param algo: name of an algorithm
     :return: what it is called in tables and pictures
     """
-    return LABELS.get(algo, algo.upper())
+    if algo in ALGORITHMS:
+        return ALGORITHMS[algo].label
+    return BASELINE_LABELS.get(algo, algo.upper())
+
+
+def is_own(algo: str) -> bool:
+    """
+    :param algo: name of an algorithm
+    :return: whether it is one that this package is for
+    """
+    return algo in with_role(Role.OWN)
 
 
 def fits(algo: str, env_id: str) -> bool:
@@ -67,7 +71,8 @@ def fits(algo: str, env_id: str) -> bool:
     :param env_id: environment
     :return: whether it can take the environment's actions
     """
-    return isinstance(_spaces(env_id)[1], ACTIONS.get(algo, spaces.Space))
+    action_space = ALGORITHMS[algo].action_space if algo in ALGORITHMS else BASELINES.get(algo, spaces.Space)
+    return isinstance(_spaces(env_id)[1], action_space)
 
 
 def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Path]) -> Configuration:
@@ -86,8 +91,11 @@ def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Pat
         return plain
     if algo in conf:
         path, source = conf[algo], conf[algo].name
-    elif algo in PACKAGED:
-        path, source = Path(str(files("sb3_knntd.zoo_configs") / f"{algo}.yml")), f"{algo}.yml of this package"
+    elif algo in ALGORITHMS:
+        packaged = ALGORITHMS[algo].config_path
+        if packaged is None:
+            return plain
+        path, source = packaged, f"{packaged.name} of this package"
     else:
         path, source = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml", f"{algo}.yml of RL Zoo"
     entries = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -106,8 +114,8 @@ def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Pat
 
 
 def _policy(algo: str, env_id: str) -> str:
-    if algo in POLICIES:
-        return POLICIES[algo]
+    if algo in ALGORITHMS:
+        return ALGORITHMS[algo].policy
     space, _ = _spaces(env_id)
     if isinstance(space, spaces.Dict):
         return "MultiInputPolicy"

@@ -17,14 +17,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_knntd.experiments.baselines.random_agent import RandomAgent
-from sb3_knntd.experiments.baselines.tile_sarsa import TileSarsa
 from sb3_knntd.experiments.compare.expressions import as_data
+from sb3_knntd.registry import ALGORITHMS
 from sb3_knntd.zoo import register
 from sb3_knntd.zoo.experiment import KNNExperimentManager
-
-#: What a comparison knows besides RL Zoo's algorithms and this package's.
-RIVALS: dict[str, type[BaseAlgorithm]] = {"sarsa": TileSarsa, "random": RandomAgent}
 
 
 def prepare(packages: Sequence[str] = ()) -> None:
@@ -35,7 +31,7 @@ def prepare(packages: Sequence[str] = ()) -> None:
     :raises Exception: whatever importing one of them does, ModuleNotFoundError if it is not there
     """
     register()
-    rl_zoo3.ALGOS.update(RIVALS)
+    rl_zoo3.ALGOS.update({name: algorithm.load() for name, algorithm in ALGORITHMS.items()})
     for package in packages:
         importlib.import_module(package)
 

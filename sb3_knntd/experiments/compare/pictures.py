@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_knntd.experiments.compare.configurations import FLOOR, OURS, label
+from sb3_knntd.experiments.compare.configurations import FLOOR, is_own, label
 from sb3_knntd.experiments.compare.results import Task
 from sb3_knntd.experiments.compare.statistics import AGGREGATES, Estimate
 from sb3_knntd.plots import LINE_COLOR, new_figure
@@ -29,8 +29,8 @@ def colors(algos: Sequence[str]) -> dict[str, str]:
     :param algos: names of all algorithms of the comparison
     :return: a colour for each: one for this project's, grey for the floor
     """
-    others = [algo for algo in algos if algo not in (*OURS, FLOOR)]
-    fixed = {**dict.fromkeys(OURS, LINE_COLOR), FLOOR: FLOOR_COLOR}
+    fixed = {**{algo: LINE_COLOR for algo in algos if is_own(algo)}, FLOOR: FLOOR_COLOR}
+    others = [algo for algo in algos if algo not in fixed]
     return {algo: COLORS[n % len(COLORS)] for n, algo in enumerate(others)} | fixed
 
 
@@ -44,7 +44,7 @@ def _new_axes(height: float = SIZE[1]) -> tuple[Figure, Axes]:
 
 
 def _draw_line(axes: Axes, x: np.ndarray, line: Estimate, algo: str, color: str, steps: bool = False) -> None:
-    above = algo in OURS
+    above = is_own(algo)
     axes.fill_between(x, line.low, line.high, color=color, alpha=0.18, linewidth=0, step="post" if steps else None)
     axes.plot(
         x,

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from sb3_knntd.common.csv_tables import csv_table
 from sb3_knntd.experiments.compare.cautions import cautions
-from sb3_knntd.experiments.compare.configurations import FLOOR, OURS, label
+from sb3_knntd.experiments.compare.configurations import FLOOR, is_own, label
 from sb3_knntd.experiments.compare.pictures import (
     colors,
     draw_aggregates,
@@ -197,7 +197,7 @@ def _store_pictures(
 
 
 def _row(algo: str, cells: Sequence[dict[str, str]]) -> dict[str, Any]:
-    return {"own": algo in OURS, "cells": [{"text": label(algo), "key": label(algo)}, *cells]}
+    return {"own": is_own(algo), "cells": [{"text": label(algo), "key": label(algo)}, *cells]}
 
 
 def _cell(row: Mapping[str, Any], column: Column) -> dict[str, str]:

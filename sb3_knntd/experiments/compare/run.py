@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_knntd.distributed.jobs import stored_as
 from sb3_knntd.experiments.compare.experiment import experiment, prepare
 from sb3_knntd.experiments.compare.machine import machine, peak_memory, versions
 
@@ -24,6 +25,7 @@ WARM_UP_STEPS = 1100
 WARM_UP_SECONDS = 10.0
 
 
+@stored_as("sb3_knntd.compare.run.run")
 def run(
     env: str,
     algo: str,

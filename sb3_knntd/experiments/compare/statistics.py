@@ -14,7 +14,7 @@ import numpy as np
 from rliable import library, metrics
 from scipy.stats import trim_mean
 
-from sb3_knntd.experiments.compare.configurations import OURS
+from sb3_knntd.experiments.compare.configurations import is_own
 from sb3_knntd.experiments.compare.results import Group, Task
 
 #: Resamples of a bootstrap.
@@ -194,7 +194,7 @@ def group_statistics(group: Group) -> GroupStatistics:
     lowest = min(0.0, min(float(drawn.min()) for drawn in final.values()))
     highest = max(1.0, max(float(drawn.max()) for drawn in final.values()))
     thresholds = np.linspace(max(lowest, -1.0), highest * 1.02, 121)
-    firsts = [algo for algo in final if algo in OURS] or list(final)[:1]
+    firsts = [algo for algo in final if is_own(algo)] or list(final)[:1]
     n_points = next(iter(scores.values())).shape[-1]
     return GroupStatistics(
         aggregates(final),

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 
-from sb3_knntd.cli import CommandError
+from sb3_knntd.common.command_line import CommandError
 from sb3_knntd.common.csv_tables import csv_table
 from sb3_knntd.common.files import replace_file
 from sb3_knntd.distributed.jobs import Job, run_jobs

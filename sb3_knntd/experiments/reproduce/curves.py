@@ -8,6 +8,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_knntd.distributed.jobs import stored_as
 from sb3_knntd.experiments.reproduce.figure import Results, Table
 from sb3_knntd.experiments.reproduce.settings import Setting, make_model, total_steps
 from sb3_knntd.experiments.reproduce.statistics import HIGH, LOW
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+@stored_as("sb3_knntd.reproduce.curves.episode_lengths")
 def episode_lengths(algorithm: str, setting: Setting, seed: int) -> list[int]:
     """
     Learn for as many episodes as the setting says.

@@ -9,6 +9,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_knntd.distributed.jobs import stored_as
 from sb3_knntd.envs.generalized_mountain_car import NOISE_SHAPE, RANGES, GeneralizedMountainCarEnv
 from sb3_knntd.envs.mountain_car import MIN_POSITION
 from sb3_knntd.experiments.reproduce.curves import draw_curves
@@ -78,6 +79,7 @@ def constant_error(env: GeneralizedMountainCarEnv) -> np.ndarray:
     return error + MEAN_NOISE * np.array(RANGES) / env.parameters.noise_divider if env.noise else error
 
 
+@stored_as("sb3_knntd.reproduce.fig4.filtered_episodes")
 def filtered_episodes(algorithm: str, setting: Setting, seed: int) -> dict[str, Any]:
     """
     Learn on filtered observations for as many episodes as the setting says, while the filter learns as well.

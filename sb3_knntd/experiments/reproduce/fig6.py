@@ -10,9 +10,9 @@ import numpy as np
 
 from sb3_knntd.experiments.reproduce.curves import curve_tables, draw_curves, episode_lengths
 from sb3_knntd.experiments.reproduce.figure import PaperFigure, Results
-from sb3_knntd.experiments.reproduce.settings import NAMES
 from sb3_knntd.experiments.reproduce.statistics import interval, quantile, seeds_range, yes_no
 from sb3_knntd.plots import BASELINE_COLOR, new_figure
+from sb3_knntd.registry import ALGORITHMS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def draw(results: Results, title: str) -> Figure:
         axes.set_xticks([tick for tick in (1, 2, 5, 10, 20, 50, 100) if tick <= axes.get_xlim()[1]])
         axes.xaxis.set_major_formatter(FuncFormatter(lambda episode, _: f"{episode:g}"))
         axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set(title=NAMES[algorithm], xlabel="episode (log scale)", ylabel="steps the pole stays up")
+        axes.set(title=ALGORITHMS[algorithm].label, xlabel="episode (log scale)", ylabel="steps the pole stays up")
         axes.label_outer()
         # Above the axes it covers no curve, wherever they rise.
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False, fontsize="small")
@@ -88,10 +88,10 @@ def verdict(results: Results) -> str:
         n_never, n_within = episodes.count(math.inf), sum(episode <= 2 * claim for episode in episodes)
         share = float(np.mean([each.share for each in successes]))
         sentences.append(
-            f"{NAMES[algorithm]}: the paper needs {claim}; here the median is {interval(episodes)}, in brackets the "
-            f"10 % and 90 % quantiles; {n_never} of {len(episodes)} seeds never get there; of the {FOLLOWED} episodes "
-            f"that follow, {100 * share:.1f} % last {FULL} steps (0 for never). Median at most {claim}: "
-            f"{yes_no(quantile(episodes, 0.5) <= claim)}; nine seeds in ten within {2 * claim} "
+            f"{ALGORITHMS[algorithm].label}: the paper needs {claim}; here the median is {interval(episodes)}, in "
+            f"brackets the 10 % and 90 % quantiles; {n_never} of {len(episodes)} seeds never get there; of the "
+            f"{FOLLOWED} episodes that follow, {100 * share:.1f} % last {FULL} steps (0 for never). Median at most "
+            f"{claim}: {yes_no(quantile(episodes, 0.5) <= claim)}; nine seeds in ten within {2 * claim} "
             f"({n_within} of {len(episodes)}): {yes_no(n_within >= MOST * len(episodes))}; nine in ten of the "
             f"episodes that follow: {yes_no(share >= MOST)}."
         )

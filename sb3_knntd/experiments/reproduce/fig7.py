@@ -9,11 +9,13 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_knntd.distributed.jobs import stored_as
 from sb3_knntd.envs import CartPoleEnv
 from sb3_knntd.experiments.reproduce.figure import PaperFigure, Results, Table
-from sb3_knntd.experiments.reproduce.settings import NAMES, Setting, make_model, total_steps
+from sb3_knntd.experiments.reproduce.settings import Setting, make_model, total_steps
 from sb3_knntd.experiments.reproduce.statistics import HIGH, LOW, interval, quantile, seeds_range, yes_no
 from sb3_knntd.plots import BASELINE_COLOR, LINE_COLOR, new_figure
+from sb3_knntd.registry import ALGORITHMS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,6 +62,7 @@ class FullEpisodeRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         return observation, reward, terminated, truncated, info
 
 
+@stored_as("sb3_knntd.reproduce.fig7.first_full_episode")
 def first_full_episode(algorithm: str, setting: Setting, seed: int) -> dict[str, Any]:
     """
     Learn until an episode lasts as long as it may, or for as many episodes as the setting says.
@@ -190,7 +193,7 @@ def _draw_route(axes: Axes, results: Results, dims: tuple[int, int], scale: floa
             linewidth=1.0,
             alpha=0.9 if above else 0.35,
             zorder=3 if above else 2,
-            label=f"{NAMES[algorithm]}, seed {seed}",
+            label=f"{ALGORITHMS[algorithm].label}, seed {seed}",
         )
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
@@ -224,7 +227,7 @@ def _draw_smoothness(axes: Axes, results: Results) -> None:
             low, median, high = (quantile(changes, share) for share in (LOW, 0.5, HIGH))
             axes.vlines(place, low, high, color=COLORS[algorithm], linewidth=2.5)
             axes.hlines(median, place - 0.35, place + 0.35, color=COLORS[algorithm], linewidth=2.5)
-        names.append(f"{NAMES[algorithm]}\n{len(changes)} of {len(results[algorithm])} seeds")
+        names.append(f"{ALGORITHMS[algorithm].label}\n{len(changes)} of {len(results[algorithm])} seeds")
     axes.set_xticks(range(len(names)), names)
     axes.set(title="Smoothness, each seed", ylabel="mean change of action a step", xlim=(-0.6, len(names) - 0.4))
     axes.set_ylim(bottom=0)
@@ -245,7 +248,7 @@ def verdict(results: Results) -> str:
         changes[algorithm] = [mean_change(actions) for actions in recorded]
         median = f"median {interval(changes[algorithm])}" if recorded else "none"
         sentences.append(
-            f"{NAMES[algorithm]}: {median}, of the {len(recorded)} of {len(by_seed)} seeds that get there."
+            f"{ALGORITHMS[algorithm].label}: {median}, of the {len(recorded)} of {len(by_seed)} seeds that get there."
         )
     sentences.append("In brackets are the 10 % and 90 % quantiles.")
     if all(changes.values()):

@@ -12,12 +12,8 @@ import numpy as np
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_knntd.envs  # noqa: F401
-from sb3_knntd.exa import ExA
-from sb3_knntd.knntd import KNNTD
-
-ALGORITHMS: dict[str, type[KNNTD] | type[ExA]] = {"knntd": KNNTD, "exa": ExA}
-#: What the algorithms are called in tables and pictures.
-NAMES = {"knntd": "kNN-TD(λ)", "exa": "Ex⟨a⟩(λ)"}
+from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.registry import ALGORITHMS
 
 #: What a setting holds besides arguments of its algorithm.
 OF_THE_EXPERIMENT = ("env", "env_kwargs", "episodes", "filter")
@@ -40,9 +36,9 @@ def load_settings(figure: str) -> dict[str, dict[str, Setting]]:
 
 def make_model(
     algorithm: str, setting: Setting, seed: int, wrap: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
-) -> KNNTD | ExA:
+) -> KNNAlgorithm:
     """
-    :param algorithm: ``"knntd"`` or ``"exa"``
+    :param algorithm: name of an algorithm of this package
     :param setting: an entry of ``paper.yml``
     :param seed: seed of the model and its environment
     :param wrap: puts wrappers around the environment
@@ -57,7 +53,8 @@ def make_model(
             share = schedule["steps"] / total_steps(setting)
             arguments[name] = LinearSchedule(schedule["start"], schedule["end"], share)
     env = wrap(gym.make(setting["env"], **setting["env_kwargs"]))
-    return ALGORITHMS[algorithm](env, seed=seed, **arguments)
+    model: KNNAlgorithm = ALGORITHMS[algorithm].load()(env, seed=seed, **arguments)
+    return model
 
 
 def total_steps(setting: Setting) -> int:

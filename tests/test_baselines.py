@@ -15,10 +15,10 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from sb3_knntd.experiments.baselines import tile_coding
 from sb3_knntd.experiments.baselines.random_agent import RandomAgent
 from sb3_knntd.experiments.baselines.tile_coding import TileCoder
 from sb3_knntd.experiments.baselines.tile_sarsa import TileSarsa
-from sb3_knntd.experiments.compare import tile_coding
 from sb3_knntd.perception.bounds import MEASURING_STEPS, Bounds
 
 

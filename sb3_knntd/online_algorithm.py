@@ -1,0 +1,233 @@
+"""The online loop: SB3 algorithms that learn from each step when it is made."""
+
+from __future__ import annotations
+
+import sys
+import time
+from abc import abstractmethod
+from collections.abc import Mapping
+from statistics import fmean
+from typing import Any, TypeVar
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from sb3_knntd.common.callback_dispatcher import CallbackDispatcher
+from sb3_knntd.common.checks import check_number
+from sb3_knntd.common.schedules import progress_remaining
+from sb3_knntd.common.transitions import StepCheck
+
+SelfOnlineAlgorithm = TypeVar("SelfOnlineAlgorithm", bound="OnlineAlgorithm")
+
+
+class OnlineAlgorithm(BaseAlgorithm):
+    """
+    Acts and learns one step at a time. A subclass says how, by :meth:`_act` and :meth:`_learn_from`.
+
+    The parameters are SB3's.
+    """
+
+    # What the last step led to, and while callbacks run the observation that was acted on.
+    _standing: Any = None
+    _acted_on: Any = None
+    _step_check: StepCheck | None = None
+
+    @abstractmethod
+    def _act(self) -> np.ndarray:
+        """The next actions, as the environments take them, shape (n_envs, *action_shape)."""
+
+    def _learn_from(
+        self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        """
+        Learn from the step that the last actions led to.
+
+        :param new_obs: the present observations, after a reset where an episode ended, shape (n_envs, *obs_shape)
+        :param rewards: shape (n_envs,)
+        :param dones: whether episodes have ended, shape (n_envs,), bool
+        :param infos: one for each environment
+        :raises ValueError: if they are not what they must be; nothing has been learned then
+        :raises FloatingPointError: if what is learned would diverge; nothing has been learned then
+        """
+
+    def _abandon_episodes(self) -> None:
+        """The environments are about to begin elsewhere: forget the actions selected for where they are."""
+
+    def _checks_steps(self) -> bool:
+        """Whether observations are arrays of the shape of the observation space, and are checked to be so."""
+        return True
+
+    def _log(self) -> Mapping[str, float]:
+        """What to log besides SB3's keys."""
+        return {}
+
+    def learn(
+        self: SelfOnlineAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 4,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOnlineAlgorithm:
+        """
+        Learn from ``total_timesteps`` steps in the environment, from each in the step that made it.
+
+        :param total_timesteps: number of environment steps, over all environments together
+        :param callback: called at every step, after it has been learned from
+        :param log_interval: number of episodes between logs, ``None`` for none
+        :param tb_log_name: name of the run in TensorBoard
+        :param reset_num_timesteps: whether to count steps from 0; if not, training goes on where it was
+        :param progress_bar: whether to show a progress bar (tqdm and rich)
+        :return: the model
+        :raises ValueError: if ``total_timesteps`` is no number, or an environment returns an array of another shape or
+            a value that is not finite. Nothing is learned from that step
+        """
+        # As SB3, which takes 1e6 as well, and does nothing for numbers below 1; but NaN would be no steps, unnoticed.
+        check_number("total_timesteps", total_timesteps)
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        dispatcher = CallbackDispatcher(callback)
+        while self.num_timesteps < total_timesteps:
+            if not self._step(dispatcher, log_interval):
+                break
+        dispatcher.flush(self.num_timesteps)
+        self.policy.set_training_mode(False)
+        callback.on_training_end()
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if self.env is None:
+            raise ValueError("there is no environment to learn from: call set_env(env) first")
+        if reset_num_timesteps or self._last_obs is None:
+            # The environments are about to be reset.
+            self._abandon_episodes()
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if self._checks_steps():
+            self._step_check = StepCheck(self.n_envs, self.observation_space.shape or ())
+            self._step_check.reset(self._last_obs)
+        self._standing = self._last_obs
+        if total_timesteps > self.num_timesteps:
+            self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
+        return total_timesteps, callback
+
+    def _step(self, dispatcher: CallbackDispatcher, log_interval: int | None) -> bool:
+        """
+        One step in every environment, and what is learned from it.
+
+        :param dispatcher: calls the callbacks
+        :param log_interval: number of episodes between logs
+        :return: whether to go on
+        """
+        env = self.env
+        assert env is not None
+        for each in dispatcher.every_step:
+            each.on_rollout_start()
+        last_obs = self._last_obs
+        if last_obs is not self._standing:
+            last_obs = self._follow_callback()
+        actions = self._act()
+        n_before = self.num_timesteps
+        try:
+            new_obs, rewards, dones, infos = env.step(actions)
+            self.num_timesteps += env.num_envs
+            self._current_progress_remaining = progress_remaining(self.num_timesteps, self._total_timesteps)
+            if self._step_check is not None:
+                self._step_check.step(new_obs, rewards, dones, infos)
+            self._learn_from(new_obs, rewards, dones, infos)  # type: ignore[arg-type]
+        except BaseException as error:
+            step, self.num_timesteps = max(self.num_timesteps, n_before + env.num_envs), n_before
+            # What was going on in the environments is lost with this step: to go on is to begin anew.
+            self._last_obs = None
+            self._abandon_episodes()
+            if type(error) in (ValueError, FloatingPointError):
+                raise type(error)(f"at step {step}: {error}. The table is as it was before this step") from error
+            raise
+        self._standing = new_obs
+        ended = dones.tolist()
+        any_ended = True in ended
+        n_logs = self._count_episodes(ended, infos, dones, log_interval) if any_ended else 0
+        if not any_ended and any("episode" in info for info in infos):
+            self._update_info_buffer(infos, dones)
+
+        # Observations are handed on and not copied: SB3's algorithms keep what a VecEnv returned as well.
+        if dispatcher.callbacks and dispatcher.record_step(new_obs, any_ended):  # type: ignore[arg-type]
+            self._acted_on = last_obs
+            try:
+                go_on = dispatcher.dispatch(locals(), self.num_timesteps, any_ended)
+            finally:
+                self._move_on()
+                self._acted_on = None
+            if not go_on:
+                return False
+        else:
+            self._last_obs = new_obs  # type: ignore[assignment]
+        if n_logs:
+            self.dump_logs()
+        for each in dispatcher.every_step:
+            each.on_rollout_end()
+        return True
+
+    def _follow_callback(self) -> Any:
+        """Begin where a callback has moved the environments, or reset those that it has set; the observations there."""
+        self._abandon_episodes()
+        if self._last_obs is None:
+            assert self.env is not None
+            self._last_obs = self.env.reset()  # type: ignore[assignment]
+        if self._step_check is not None:
+            self._step_check.reset(self._last_obs)
+        return self._last_obs
+
+    def _move_on(self) -> None:
+        """Be where the step led, or where a callback says that the environments are: episodes begin there."""
+        if self._last_obs is self._acted_on:
+            self._last_obs = self._standing
+        else:
+            self._abandon_episodes()
+
+    def _count_episodes(
+        self, ended: list[bool], infos: list[dict[str, Any]], dones: np.ndarray, log_interval: int | None
+    ) -> int:
+        """Count the episodes that ended; how often a log is due."""
+        self._update_info_buffer(infos, dones)
+        before = self._episode_num
+        self._episode_num += ended.count(True)
+        return self._episode_num // log_interval - before // log_interval if log_interval else 0
+
+    def dump_logs(self) -> None:
+        """Write the log, under SB3's keys and the algorithm's own."""
+        assert self.ep_info_buffer is not None
+        assert self.ep_success_buffer is not None
+        elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
+        record = self.logger.record
+        record("time/episodes", self._episode_num, exclude="tensorboard")
+        record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
+        record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+        record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        if len(self.ep_info_buffer) > 0:
+            record("rollout/ep_rew_mean", fmean([info["r"] for info in self.ep_info_buffer]))
+            record("rollout/ep_len_mean", fmean([info["l"] for info in self.ep_info_buffer]))
+        if len(self.ep_success_buffer) > 0:
+            record("rollout/success_rate", fmean(self.ep_success_buffer))
+        for key, value in self._log().items():
+            record(key, value)
+        self.logger.dump(step=self.num_timesteps)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_standing", "_acted_on", "_step_check"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy"], []
