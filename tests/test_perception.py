@@ -250,11 +250,11 @@ def test_a_state_without_places_leaves_them() -> None:
         (th.from_numpy(PLACES[:4]), r"points\.places must have at least n_neighbors=5 rows; got shape \(4, 2\)"),
         (th.tensor(1.0), "at least n_neighbors=5 rows"),
         (th.from_numpy(PLACES.repeat(2, axis=1)), r"points\.places must have shape \(any, 2\)"),
-        (th.from_numpy(PLACES).float(), r"points\.places must be of type torch\.float64"),
+        (th.from_numpy(PLACES).int(), r"points\.places must be of type float"),
         (th.from_numpy(PLACES * np.nan), r"points\.places must be finite"),
         ("places", r"points\.places must be a tensor"),
     ],
-    ids=["few", "one number", "wide", "float32", "NaN", "a word"],
+    ids=["few", "one number", "wide", "integers", "NaN", "a word"],
 )
 def test_places_that_do_not_fit_are_not_loaded(places: Any, message: str) -> None:
     perceiver = make(points=PLACES)

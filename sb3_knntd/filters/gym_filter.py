@@ -1,4 +1,4 @@
-"""The δs filter around a gymnasium environment."""
+"""The δs filter as a wrapper of a gymnasium environment."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from sb3_knntd.filters.table import DeltaTable, FilterArguments
 
 class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs):
     """
-    Takes noise out of observations by learning how the state changes: the k-NN δs filter (Algorithm 5 of the paper),
+    Reduces the noise of observations by learning how the state changes: the k-NN δs filter (Algorithm 5 of the paper),
     with a gain that adapts to the noise.
 
-    It learns δ(s, a), the expected change of the state, in a table over perception points (eqs. 28 and 31 to 33). A
-    step predicts s + δ(s, a) from the last estimate s, compares that with what is observed, and returns the prediction
-    plus a gain times that difference, the innovation. With ``learning_rate=0.5, gain=None, warmup=0`` it is
-    Algorithm 5 itself.
+    It learns δ(s, a), the expected change of the state, in a table over perception points (eqs. 28 and 31 to 33). Each
+    step predicts s + δ(s, a) from the last estimate s, and returns the prediction plus a gain times the innovation, the
+    difference of the observation from the prediction. With ``learning_rate=0.5, gain=None, warmup=0`` it equals
+    Algorithm 5.
 
-    An episode begins with the raw observation. ``info["raw_observation"]`` is what came in. Estimates can lie a little
-    outside of the observation space's bounds.
+    The first observation of an episode is returned unchanged. ``info["raw_observation"]`` is the observation before
+    filtering. Estimates can lie slightly outside the bounds of the observation space.
 
     .. code-block:: python
 
@@ -36,30 +36,31 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
         env.training = False
 
     :param env: environment with observations in a Box of shape (n,), and Discrete or Box actions
-    :param learning_rate: ``"count"``: one over the visits of an entry, down to 0.001, so that it is the mean of what
-        was seen there; α in [0, 1]; or a function of the remaining progress (from 1 to 0)
-    :param update: ``"averaging"``: each entry moves towards the change that was seen; ``"gradient"``: all neighbours
-        move by the error of their weighted mean; ``None`` is averaging with ``"count"``, and gradient otherwise
-    :param reference: what changes are measured and predicted from: the last ``"filtered"`` state or the last
+    :param learning_rate: ``"count"``: one over the visits of an entry, at least 0.001, so that an entry is the mean of
+        the changes observed there; α in [0, 1]; or a function of the remaining progress (from 1 to 0)
+    :param update: ``"averaging"``: each entry moves towards the observed change; ``"gradient"``: all neighbours move by
+        the error of their weighted mean; ``None`` is averaging with ``"count"``, and gradient otherwise
+    :param reference: the state that changes are measured and predicted from: the last ``"filtered"`` or the last
         ``"observed"`` one
-    :param gain: what the innovation is multiplied by: ``"adaptive"``, by dimension from the correlation of successive
-        innovations, which a steady-state Kalman filter would leave without (Mehra, "On the identification of variances
-        and adaptive Kalman filtering", 1970); a number in (0, 1], or one a dimension; ``None``: the update of the table
-        alone corrects the estimate, as in Algorithm 5
-    :param warmup: visits, each shared among the neighbours as they count, that the neighbours of a state must have for
-        the action, in their weighted mean, for their prediction to be trusted; until then the raw observation passes
+    :param gain: factor of the innovation: ``"adaptive"``, in each dimension from the correlation of successive
+        innovations, which is zero for the steady-state Kalman filter (Mehra, "On the identification of variances and
+        adaptive Kalman filtering", 1970); a number in (0, 1], or one per dimension; ``None``: only the update of the
+        table corrects the estimate, as in Algorithm 5
+    :param warmup: number of visits, as the weighted mean over the neighbours, from which on a prediction is trusted;
+        until then the observation is returned unchanged. A visit is divided among the neighbours by their probabilities
     :param n_neighbors: k >= 1; ``"auto"`` is 2 obs_dim + 1
-    :param points: see :class:`~sb3_knntd.KNNTD`; ``"auto"`` is a lattice of about 2000 points, at most 20 a dimension
-    :param bounds: see :class:`~sb3_knntd.KNNTD`; the range of dimensions without one is measured over the first 1000
-        observations (100 of each environment), which pass as they are
+    :param points: see :class:`~sb3_knntd.KNNTD`; ``"auto"`` is a lattice of about 2000 points, at most 20 per
+        dimension
+    :param bounds: see :class:`~sb3_knntd.KNNTD`; the range of unbounded dimensions is measured over the first 1000
+        observations, or 100 per environment if those are more, which are returned unchanged
     :param weights: see :class:`~sb3_knntd.KNNTD`
     :param bandwidth: see :class:`~sb3_knntd.KNNTD`
     :param search: see :class:`~sb3_knntd.KNNTD`
-    :param action_points: for Box actions, whose nearest point stands for them: an int >= 2 or one int a dimension for
-        evenly spaced points, or rising arrays, one a dimension, in action units
-    :param total_timesteps: over how many steps a schedule of the learning rate goes
+    :param action_points: for Box actions, each of which is represented by its nearest point: an int >= 2 or one int per
+        dimension for evenly spaced points, or ascending arrays, one per dimension, in action units
+    :param total_timesteps: number of steps that a schedule of the learning rate spans
     :param training: whether to learn; can be set at any time
-    :param compiled: whether to use the compiled step where it can be used: with numba, and weights that are no function
+    :param compiled: whether to use the compiled step where possible: with numba, and weights that are not a function
     :raises ValueError: if an argument or a space does not fit; the message says which, and what would
     """
 
@@ -89,7 +90,7 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
     def _set_up(self, env: gym.Env[np.ndarray, Any], table: DeltaTable, training: bool) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, **table.arguments.to_dict(), training=training)
         gym.Wrapper.__init__(self, env)
-        #: what was learned
+        #: the table
         self.table = table
         #: whether to learn
         self.training = training
@@ -103,7 +104,7 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
         """
         :param seed: see :meth:`gymnasium.Env.reset`
         :param options: see :meth:`gymnasium.Env.reset`
-        :return: the observation as it is, and info with ``raw_observation``
+        :return: the observation, unchanged, and info with ``raw_observation``
         :raises ValueError: if the observation is not finite
         """
         observation, info = self.env.reset(seed=seed, options=options)
@@ -114,7 +115,7 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
     def step(self, action: Any) -> tuple[np.ndarray, SupportsFloat, bool, bool, dict[str, Any]]:
         """
         :param action: see :meth:`gymnasium.Env.step`
-        :return: as the environment does, with the estimated state for an observation, and ``raw_observation`` in info
+        :return: what the environment returns, with the estimated state as observation, and ``raw_observation`` in info
         :raises ValueError: if the observation is not finite; nothing is learned from it
         """
         columns = self.table.columns(np.asarray(action)[None])
@@ -126,7 +127,7 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
 
     def get_original_obs(self) -> np.ndarray:
         """
-        :return: the last observation as it came in, shape (obs_dim,)
+        :return: the last observation before filtering, shape (obs_dim,)
         :raises ValueError: if there is none yet
         """
         if self._raw_observation is None:
@@ -136,15 +137,15 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
     def for_evaluation(self, env: gym.Env[np.ndarray, Any]) -> DeltaFilter:
         """
         :param env: another environment with the same spaces
-        :return: a filter around it that uses what this one has learned and goes on learning, and learns nothing itself
-        :raises ValueError: if the spaces are others
+        :return: a filter of it that does not learn, and shares the table of this one, which continues to learn
+        :raises ValueError: if the spaces differ
         """
         self.table.check_spaces(env.observation_space, env.action_space)
         return self._around(env, self.table, training=False)
 
     def save(self, path: str | pathlib.Path) -> None:
         """
-        Save parameters and all that was learned; where the environment is now is not saved.
+        Save the parameters and everything that was learned. The state of the environment is not saved.
 
         :param path: file, with ``.zip`` added if it has no suffix
         """
@@ -153,13 +154,13 @@ class DeltaFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Recor
     @classmethod
     def load(cls, path: str | pathlib.Path, env: gym.Env[np.ndarray, Any], trusted: bool = False) -> DeltaFilter:
         """
-        :param path: file that a :class:`DeltaFilter` or a :class:`VecDeltaFilter` has saved
+        :param path: file saved by a :class:`DeltaFilter` or a :class:`VecDeltaFilter`
         :param env: the environment to filter
-        :param trusted: whether to unpickle functions that the file holds (``weights``, ``learning_rate``), which
-            is to run what it says
-        :return: the filter as it was
-        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``env`` has;
-            without trust also if it holds functions
+        :param trusted: whether to unpickle functions in the file (``weights``, ``learning_rate``). That runs code from
+            the file
+        :return: the filter
+        :raises ValueError: if the file is damaged, holds something else, or is for other spaces than those of ``env``;
+            without ``trusted`` also if it holds functions
         """
         return cls._around(env, *load_table(path, env.observation_space, env.action_space, trusted))
 

@@ -1,4 +1,4 @@
-"""The δs filter around a VecEnv."""
+"""The δs filter as a wrapper of a VecEnv."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_knntd.common.checks import check_finite, check_flag
+from sb3_knntd.common.checks import check_flag
+from sb3_knntd.common.transitions import check_finite
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
 from sb3_knntd.filters.table import DeltaTable, FilterArguments
@@ -20,14 +21,13 @@ from sb3_knntd.filters.table import DeltaTable, FilterArguments
 
 class VecDeltaFilter(VecEnvWrapper):
     """
-    :class:`~sb3_knntd.DeltaFilter` for vectorised environments: they share one table, and each has an estimate of its
-    own.
+    :class:`~sb3_knntd.DeltaFilter` for vectorised environments. They share one table; each has its own estimate.
 
-    The last observation of an episode, ``infos[i]["terminal_observation"]``, is filtered as well;
-    ``infos[i]["raw_observation"]`` and ``infos[i]["raw_terminal_observation"]`` are what came in.
+    The last observation of an episode, ``infos[i]["terminal_observation"]``, is filtered as well.
+    ``infos[i]["raw_observation"]`` and ``infos[i]["raw_terminal_observation"]`` are the observations before filtering.
 
-    VecNormalize and VecFrameStack belong around it, so that it sees one state in units that stay:
-    ``VecNormalize(VecDeltaFilter(venv))``.
+    Put VecNormalize and VecFrameStack outside: ``VecNormalize(VecDeltaFilter(venv))``. The filter needs single
+    observations in units that do not change.
 
     .. code-block:: python
 
@@ -39,7 +39,7 @@ class VecDeltaFilter(VecEnvWrapper):
     Parameters not named here are those of :class:`~sb3_knntd.DeltaFilter`.
 
     :param venv: environments with observations in a Box of shape (n,), and Discrete or Box actions
-    :param training: whether to learn; can be set at any time, as VecNormalize's
+    :param training: whether to learn; can be set at any time, as that of VecNormalize
     :raises ValueError: if an argument or a space does not fit; the message says which, and what would
     """
 
@@ -72,9 +72,9 @@ class VecDeltaFilter(VecEnvWrapper):
                 "and off-policy algorithms store those from before both. Better VecNormalize(VecDeltaFilter(venv))",
                 stacklevel=2,
             )
-        # Where observations are normalised the space does not tell their range.
+        # The bounds of the space do not hold for normalised observations.
         table = DeltaTable(venv.observation_space, venv.action_space, arguments, bounds_from_space=not normalizes)
-        #: what is learned
+        #: the table
         self.table = table
         #: whether to learn
         self.training = training
@@ -82,10 +82,10 @@ class VecDeltaFilter(VecEnvWrapper):
 
     def set_venv(self, venv: VecEnv) -> None:
         """
-        Put the filter around environments; they have to be reset.
+        Set the environments to filter. They have to be reset.
 
-        :param venv: environments with the spaces of those it was made for
-        :raises ValueError: if the spaces are others
+        :param venv: environments with the spaces of the filter
+        :raises ValueError: if the spaces differ
         """
         self.table.check_spaces(venv.observation_space, venv.action_space)
         VecEnvWrapper.__init__(self, venv)
@@ -95,7 +95,7 @@ class VecDeltaFilter(VecEnvWrapper):
 
     def reset(self) -> np.ndarray:
         """
-        :return: the observations as they are, shape (n_envs, obs_dim)
+        :return: the observations, unchanged, shape (n_envs, obs_dim)
         :raises ValueError: if one is not finite
         """
         observations = self.venv.reset()
@@ -113,7 +113,7 @@ class VecDeltaFilter(VecEnvWrapper):
 
     def step_wait(self) -> VecEnvStepReturn:
         """
-        :return: as the environments do, with the estimated states for observations
+        :return: what the environments return, with the estimated states as observations
         :raises ValueError: if an observation is not finite; nothing is learned from this step
         """
         observations, rewards, dones, infos = self.venv.step_wait()
@@ -139,7 +139,7 @@ class VecDeltaFilter(VecEnvWrapper):
 
     def get_original_obs(self) -> np.ndarray:
         """
-        :return: the last observations as they came in, shape (n_envs, obs_dim)
+        :return: the last observations before filtering, shape (n_envs, obs_dim)
         :raises ValueError: if there are none yet
         """
         if self._raw_observations is None:
@@ -149,15 +149,14 @@ class VecDeltaFilter(VecEnvWrapper):
     def for_evaluation(self, venv: VecEnv) -> VecDeltaFilter:
         """
         :param venv: other environments with the same spaces
-        :return: a filter around them that uses what this one has learned and goes on learning, and learns nothing
-            itself
-        :raises ValueError: if the spaces are others
+        :return: a filter of them that does not learn, and shares the table of this one, which continues to learn
+        :raises ValueError: if the spaces differ
         """
         return self._around(venv, self.table, training=False)
 
     def save(self, path: str | pathlib.Path) -> None:
         """
-        Save parameters and all that was learned; where the environments are now is not saved.
+        Save the parameters and everything that was learned. The state of the environments is not saved.
 
         :param path: file, with ``.zip`` added if it has no suffix
         """
@@ -166,13 +165,13 @@ class VecDeltaFilter(VecEnvWrapper):
     @classmethod
     def load(cls, path: str | pathlib.Path, venv: VecEnv, trusted: bool = False) -> VecDeltaFilter:
         """
-        :param path: file that a :class:`VecDeltaFilter` or a :class:`DeltaFilter` has saved
+        :param path: file saved by a :class:`VecDeltaFilter` or a :class:`DeltaFilter`
         :param venv: the environments to filter
-        :param trusted: whether to unpickle functions that the file holds (``weights``, ``learning_rate``), which
-            is to run what it says
-        :return: the filter as it was
-        :raises ValueError: if the file is damaged, holds something else, or is of other spaces than ``venv`` has;
-            without trust also if it holds functions
+        :param trusted: whether to unpickle functions in the file (``weights``, ``learning_rate``). That runs code from
+            the file
+        :return: the filter
+        :raises ValueError: if the file is damaged, holds something else, or is for other spaces than those of ``venv``;
+            without ``trusted`` also if it holds functions
         """
         return cls._around(venv, *load_table(path, venv.observation_space, venv.action_space, trusted))
 
@@ -184,7 +183,7 @@ class VecDeltaFilter(VecEnvWrapper):
         return around
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is learned, without the environments, which need not be picklable: :meth:`set_venv` gives new ones."""
+        """Without the environments, which may not be picklable. :meth:`set_venv` sets new ones."""
         return {"table": self.table, "training": self.training}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

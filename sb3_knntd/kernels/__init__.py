@@ -1,7 +1,6 @@
 """
-The compiled CPU step. Everything here works on NumPy arrays and numbers alone, and knows nothing of the
-rest of the package. Arrays that belong together travel as plain tuples, which numba takes in fastest;
-each tuple is described where it is made.
+The compiled CPU step. Its modules use NumPy arrays and numbers only, and import nothing else of the package. Arrays
+that belong together are declared as named tuples beside the functions that take them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compile the kernels now, so that no later run has to wait for it: ``python -m sb3_knntd.kernels``."""
+"""Compile the kernels ahead of the first run: ``python -m sb3_knntd.kernels``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sb3_knntd import KNNTD, DeltaFilter, ExA
 
 
 def main() -> None:
-    """Learn and predict one step with each type of table and of observations, and filter one."""
+    """Learn, predict and filter one step with each type of table and of observations."""
     for env_id, dtype in (
         ("MountainCar-v0", th.float64),
         ("MountainCar-v0", th.float32),

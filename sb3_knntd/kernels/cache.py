@@ -1,4 +1,4 @@
-"""numba's cache on disk, without which everything works as well, and only takes longer."""
+"""Cache of compiled functions on disk. Without it the kernels are compiled again in each process."""
 
 from __future__ import annotations
 
@@ -14,36 +14,36 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 DIGEST_SIZE = sha256().digest_size
 
 
-class _Complaint:
-    """Tells once in a process why compiling takes long."""
+class _WarnOnce:
+    """Warns once in a process why the kernels have to be compiled."""
 
     def __init__(self) -> None:
-        self._is_made = False
+        self._has_warned = False
 
-    def __call__(self, why: str) -> None:
-        if not self._is_made:
-            self._is_made = True
+    def __call__(self, reason: str) -> None:
+        if not self._has_warned:
+            self._has_warned = True
             warnings.warn(
-                f"the kernels are compiled anew, which takes up to a minute: {why}. Set NUMBA_CACHE_DIR to a folder "
+                f"the kernels are compiled anew, which takes up to a minute: {reason}. Set NUMBA_CACHE_DIR to a folder "
                 "that can be written to",
                 RuntimeWarning,
                 stacklevel=2,
             )
 
 
-complain = _Complaint()
+warn_once = _WarnOnce()
 
 
 class CheckedFile(IndexDataCacheFile):
-    """Files with a digest: machine code of which a bit is another would be run all the same."""
+    """Cache files with a checksum. Without one, damaged machine code would be run."""
 
     def __init__(self, **arguments: Any) -> None:
         super().__init__(**arguments)
-        # What numba has written without digests is of another version, and not damaged.
+        # Files that numba wrote without checksums count as another version, not as damaged.
         self._version = f"{numba.__version__} with digests"
 
     def _dump(self, obj: Any) -> bytes:
-        # Behind, where pickle does not look.
+        # pickle ignores what follows the object.
         content: bytes = super()._dump(obj)
         return content + sha256(content).digest()
 
@@ -57,9 +57,9 @@ class CheckedFile(IndexDataCacheFile):
 
 class KernelCache(FunctionCache):
     """
-    Keeps compiled functions on disk. What cannot be read or written there is compiled anew.
+    Cache of a compiled function on disk. If it cannot be read or written, the function is compiled again.
 
-    :param function: whose results it keeps
+    :param function: the function
     :raises RuntimeError: if there is no folder that can be written to
     """
 
@@ -74,15 +74,15 @@ class KernelCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """
         :param sig: types of the arguments
-        :param target_context: numba's
-        :return: the compiled function, ``None`` if it has to be compiled
+        :param target_context: see numba
+        :return: the compiled function; ``None`` if it is not in the cache
         """
         try:
             return super().load_overload(sig, target_context)
-        except Exception as error:  # a damaged pickle raises anything
-            complain(f"numba's cache in {self.cache_path} cannot be read ({_told(error)})")
+        except Exception as error:  # a damaged pickle can raise any error
+            warn_once(f"numba's cache in {self.cache_path} cannot be read ({_describe(error)})")
             try:
-                # Or what is compiled now could not be kept either.
+                # Without a new index, what is compiled now could not be saved.
                 self.flush()
             except OSError:
                 self.disable()
@@ -96,32 +96,32 @@ class KernelCache(FunctionCache):
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            complain(f"numba's cache in {self.cache_path} cannot be written ({_told(error)})")
+            warn_once(f"numba's cache in {self.cache_path} cannot be written ({_describe(error)})")
 
 
 class NoCache(NullCache):
-    """Says that there is none when something is compiled."""
+    """No cache. Warns when a function is compiled."""
 
     def load_overload(self, sig: Any, target_context: Any) -> None:
         """
         :param sig: types of the arguments
-        :param target_context: numba's
+        :param target_context: see numba
         """
         folder = os.environ.get("NUMBA_CACHE_DIR")
-        complain(f"numba has no folder for its cache{f', NUMBA_CACHE_DIR is {folder!r}' if folder else ''}")
+        warn_once(f"numba has no folder for its cache{f', NUMBA_CACHE_DIR is {folder!r}' if folder else ''}")
 
 
 def keep(dispatcher: Any) -> None:
     """
-    Have numba keep what it compiles, if it can.
+    Cache a function on disk, if there is a folder to write to.
 
-    :param dispatcher: numba's, of a function
+    :param dispatcher: the function, compiled by numba
     """
     try:
         dispatcher._cache = KernelCache(dispatcher.py_func)
-    except RuntimeError:  # there is no folder that numba may write to
+    except RuntimeError:  # there is no folder to write to
         dispatcher._cache = NoCache()
 
 
-def _told(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"

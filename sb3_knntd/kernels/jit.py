@@ -1,4 +1,4 @@
-"""numba's compiler, or, where it cannot be used, none."""
+"""Compilation with numba, or none where numba cannot be used."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ try:
     AVAILABLE = not getattr(numba.config, "DISABLE_JIT", 0)
     #: why numba cannot be used, empty if it can
     REASON = "" if AVAILABLE else "NUMBA_DISABLE_JIT is set"
-except Exception as error:  # a numba that does not fit the installed NumPy raises more than ImportError
+except Exception as error:  # with a NumPy that it does not support, numba raises other errors than ImportError
     AVAILABLE = False
     REASON = f"{type(error).__name__}: {error}"
 
 
 def jit(function: Function, forceinline: bool = False) -> Function:
     """
-    Compile on the first call, keep the result on disk, and let other threads run meanwhile.
+    Compile a function on its first call, without the GIL, and cache the result on disk.
 
-    :param function: to be compiled
-    :param forceinline: whether compiled functions have it in place of their calls
+    :param function: the function
+    :param forceinline: whether to inline it into compiled functions that call it
     :return: the compiled function, or ``function`` itself without numba
     """
     if not AVAILABLE:
@@ -37,10 +37,10 @@ def jit(function: Function, forceinline: bool = False) -> Function:
 
 def inlined(function: Function) -> Function:
     """
-    As :func:`jit`, in place of every call by compiled functions. For what is called for each neighbour: handing over a
-    dozen arrays takes longer than a glance into them.
+    :func:`jit`, inlined into compiled functions that call it. For functions called for each neighbour: passing a dozen
+    arrays takes longer than to read from them.
 
-    :param function: to be compiled
+    :param function: the function
     :return: the compiled function, or ``function`` itself without numba
     """
     return jit(function, forceinline=True)

@@ -1,4 +1,4 @@
-"""The k nearest points, by (squared distance, index), without and with a list of the points."""
+"""Search for the k nearest points, ordered by (squared distance, index)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,15 @@ from sb3_knntd.kernels.jit import jit
 @jit
 def _next_coordinate(x, axes, below, above, first, end):
     """
-    Which of the next coordinates on either side of x is nearer, the lower of equals, and the square of how far it is.
+    Find the nearer of the next coordinates below and above x; at equal distance, the lower one.
 
-    :param below: the next one down; none if it is less than ``first``
-    :param above: the next one up; none if it is ``end``
+    :param x: value in one dimension, scaled units
+    :param axes: see :func:`nearest_on_lattice`
+    :param below: index of the next coordinate below; there is none if it is less than ``first``
+    :param above: index of the next coordinate above; there is none if it is ``end``
+    :param first: index of the first coordinate of the dimension
+    :param end: index after its last coordinate
+    :return: the index of the nearer one, and its squared distance
     """
     down = x - axes[below] if below >= first else np.inf
     up = axes[above] - x if above < end else np.inf
@@ -23,7 +28,7 @@ def _next_coordinate(x, axes, below, above, first, end):
 
 @jit
 def _coordinates_up_to(x, axes, first, end):
-    """How many of a dimension's coordinates are at most x."""
+    """Count the coordinates of a dimension that are at most x."""
     low, high = first, end
     while low < high:
         middle = (low + high) // 2
@@ -37,20 +42,21 @@ def _coordinates_up_to(x, axes, first, end):
 @jit
 def _first_on_lattice(scaled, axes, offsets, count):
     """
-    The ``count`` smallest sums of squares, one for each dimension, and the numbers of their points.
+    Find the ``count`` points with the smallest squared distances.
 
-    Dimension by dimension, a list of the first points in the dimensions so far becomes one with the next dimension.
-    Each coordinate of that, by rising distance, makes a row: the list with the coordinate's square added. The rows are
-    merged, none of which can come to its turn before the last one's first has.
+    The list of the nearest points in the first dimensions is extended by one dimension after the other. Each coordinate
+    of the new dimension, by ascending distance, gives a row: the list with the squared distance of that coordinate
+    added. Each row is sorted; the rows are merged. No element of a row is less than the first of the row before, so a
+    row is opened only when the first element of the last one has been taken.
 
     :param scaled: observation, scaled units, shape (obs_dim,)
-    :param axes: the coordinates of every dimension one after the other, each rising
-    :param offsets: where each dimension's begin, and the end, shape (obs_dim + 1,), int64
-    :param count: how many, at most the number of points
-    :return: sums and numbers, in their order, of shape (count,) each
+    :param axes: see :func:`nearest_on_lattice`
+    :param offsets: likewise
+    :param count: number of points to find, at most the number of points there are
+    :return: squared distances and indices, by (distance, index) but for rounding, shape (count,) each
     """
-    # The list as it was and as it becomes; and of each row its square and the sum that it has next, its coordinate and
-    # where in the list it is.
+    # The old and the new list. For each row: the squared distance of its coordinate, its next sum, its coordinate, and
+    # its position in the old list.
     floats, integers = np.empty((4, count)), np.empty((4, count), np.int64)
     sums, before, squares, nexts = floats[0], floats[1], floats[2], floats[3]
     numbers, numbers_before, coordinates, places = integers[0], integers[1], integers[2], integers[3]
@@ -61,7 +67,7 @@ def _first_on_lattice(scaled, axes, offsets, count):
         sums, before, numbers, numbers_before = before, sums, numbers_before, numbers
         above = first + _coordinates_up_to(x, axes, first, end)
         below = above - 1
-        # Rows from ``opened`` to before ``n_rows`` have begun and are not at their end.
+        # Rows before ``opened`` are exhausted. Rows from ``n_rows`` on are not opened yet.
         opened, n_rows, newest = 0, 0, True
         n_merged = min(count, filled * size)
         for i in range(n_merged):
@@ -81,7 +87,7 @@ def _first_on_lattice(scaled, axes, offsets, count):
                     if nexts[other] < nexts[row] or others < number:
                         row, number = other, others
             total, place = nexts[row], i
-            # Where rounding has made a tie, a lower number can come late.
+            # Where rounding makes sums equal, a lower index can come later.
             while place > 0 and sums[place - 1] == total and numbers[place - 1] > number:
                 sums[place], numbers[place] = total, numbers[place - 1]
                 place -= 1
@@ -98,8 +104,8 @@ def _first_on_lattice(scaled, axes, offsets, count):
 @jit
 def _blurred(scaled, axes, offsets, total):
     """
-    Whether two coordinates at different distances could give the same sum, of about ``total``, by rounding. If
-    not, equal sums have equal terms, and of equals the lower coordinate comes first.
+    Whether rounding could make sums of about ``total`` equal for two coordinates at different distances. If not, equal
+    sums have equal terms, and their order is that of the indices.
     """
     least = 2.0 * len(scaled) * 2.3e-16 * total
     for j in range(len(scaled)):
@@ -123,16 +129,16 @@ def _blurred(scaled, axes, offsets, total):
 @jit
 def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
     """
-    The k nearest points of a lattice, without visiting the others.
+    Find the k nearest points of a lattice without computing the distances to all.
 
-    A squared distance is a sum over the dimensions, and a point of which k others are at least as near in every
-    dimension is not among the first. So a list of k is enough to go from dimension to dimension; rounding keeps sums in
-    order. Points that tie are in order of index, unless rounding could have made them tie; then as many are looked
-    at as equal the k-th. So the answer is that of a search over all points.
+    A squared distance is a sum over the dimensions. A point is not among the k nearest if k others are at least as near
+    in each dimension. So a list of k points is enough from one dimension to the next; rounding preserves the order of
+    sums. Ties are in the order of the indices, unless rounding could have caused them: then all points that tie with
+    the k-th are compared. The result is that of a search over all points.
 
     :param scaled: observation, scaled units, shape (obs_dim,)
-    :param axes: the coordinates of every dimension one after the other, each rising
-    :param offsets: where each dimension's begin, and the end, shape (obs_dim + 1,), int64
+    :param axes: the coordinates of all dimensions, concatenated, ascending in each, scaled units
+    :param offsets: index of the first coordinate of each dimension, and the total number, shape (obs_dim + 1,), int64
     :param k: number of neighbours, at most the number of points
     :param indices: to be filled, shape (k,), int64
     :param distances: to be filled with squared distances, shape (k,)
@@ -140,7 +146,7 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
     n_points = 1
     for j in range(len(scaled)):
         n_points *= offsets[j + 1] - offsets[j]
-    # One more tells whether the last has equals.
+    # One more point shows whether the k-th is tied.
     count = min(k + 1, n_points)
     sums, numbers = _first_on_lattice(scaled, axes, offsets, count)
     if count > k and sums[k] == sums[k - 1] and _blurred(scaled, axes, offsets, sums[k]):
@@ -155,7 +161,7 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
 @jit
 def nearest_of_all(scaled, columns, k, indices, distances):
     """
-    The k nearest points by computing every distance.
+    Find the k nearest points by computing all distances.
 
     :param scaled: observation, scaled units, shape (obs_dim,)
     :param columns: the points' coordinates, scaled units, shape (obs_dim, n_points)
@@ -170,7 +176,7 @@ def nearest_of_all(scaled, columns, k, indices, distances):
         for j in range(n_dims):
             difference = scaled[j] - columns[j, point]
             total += difference * difference
-        # Points come by rising index: one as far as the last of k full places comes after it.
+        # Indices ascend: a point at the distance of the k-th comes after it.
         if count == k and total >= distances[k - 1]:
             continue
         place = count if count < k else k - 1
@@ -194,11 +200,11 @@ def nearest_on_lattice_batch(scaled, axes, offsets, k, indices, distances):
 @jit
 def order_candidates(scaled, places, candidates, indices, distances):
     """
-    The first k of some candidates by (squared distance, index), for each of a batch.
+    Order candidates by (squared distance, index) and take the first k, for a batch of observations.
 
     :param scaled: observations, scaled units, shape (batch, obs_dim)
     :param places: the points' coordinates, scaled units, shape (n_points, obs_dim)
-    :param candidates: points, at least k, shape (batch, n), int64
+    :param candidates: indices of points, at least k, shape (batch, n), int64
     :param indices: to be filled, shape (batch, k), int64
     :param distances: to be filled with squared distances, shape (batch, k)
     """

@@ -107,7 +107,7 @@ class Scattered(Points, nn.Module):
         name = prefix + "places"
         if name in state_dict:
             # The number of points can differ from that at construction.
-            places = checked_tensor(state_dict, name, (None, self.obs_dim), th.float64)
+            places = checked_tensor(state_dict, name, (None, self.obs_dim))
             self._set(places.to(self.places, copy=True))
         super()._load_from_state_dict({**state_dict, name: self.places}, prefix, *args)
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Protocol
 
 import torch as th
 
-from sb3_knntd.common.checks import LEAST, check_number, check_word, shown
+from sb3_knntd.common.checks import LEAST, check_member, check_number, shown
 from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels.perceive import Weighting
 
@@ -123,10 +123,7 @@ class Custom:
         return answer.double()
 
 
-#: The words that users pass are the names of the members in lower case.
-_BUILT_IN: dict[str, type[KernelWeights]] = {
-    weights.WEIGHTING.name.lower(): weights for weights in (InverseQuadratic, Gaussian)
-}
+_BUILT_IN: dict[Weighting, type[KernelWeights]] = {kind.WEIGHTING: kind for kind in (InverseQuadratic, Gaussian)}
 
 
 def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
@@ -141,8 +138,7 @@ def make_weights(weights: Any, bandwidth: float, n_neighbors: int) -> Weights:
     """
     bandwidth = check_number("bandwidth", bandwidth, LEAST)
     if not callable(weights):
-        check_word("weights", weights, _BUILT_IN)
-        return _BUILT_IN[weights](bandwidth)
+        return _BUILT_IN[check_member("weights", weights, _BUILT_IN)](bandwidth)
     custom = Custom(weights)
     # From an observation on a point to one at the far corner of a four-dimensional box. There are more rows than
     # neighbours, so that a function that confuses the axes returns a wrong shape.
