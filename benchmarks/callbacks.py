@@ -29,7 +29,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from benchmarks.machine import describe
 from sb3_knntd import KNNTD
-from sb3_knntd.common.callback_dispatcher import Audience
+from sb3_knntd.common.callback_dispatcher import CallbackDispatcher
 
 ENV_ID = "MountainCar-v0"
 TOGETHER = "all five together"
@@ -118,17 +118,17 @@ def call_seconds(callback: BaseCallback, folder: Path, repeats: int) -> float:
     for each in getattr(callback, "callbacks", [callback]):
         if hasattr(each, "_act"):
             each._act = lambda: None
-    audience, observations = Audience(callback), seen["new_obs"]
+    dispatcher, observations = CallbackDispatcher(callback), seen["new_obs"]
     times = []
     for _ in range(repeats):
         start = time.process_time()
         for _ in range(STEPS):
             # What the algorithm does about its callbacks in a step.
-            for listener in audience.listeners:
+            for listener in dispatcher.every_step:
                 listener.on_rollout_start()
-            if audience.hears(observations, False):
-                audience.tell(dict(seen), model.num_timesteps)
-            for listener in audience.listeners:
+            if dispatcher.record_step(observations, False):
+                dispatcher.dispatch(dict(seen), model.num_timesteps, False)
+            for listener in dispatcher.every_step:
                 listener.on_rollout_end()
         times.append((time.process_time() - start) / STEPS)
     return min(times)

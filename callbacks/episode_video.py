@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, sync_envs_norm
 from sb3_knntd.common.checks import check_integer, check_path, shown
 from sb3_knntd.common.files import replace_file
 
-from .paced import PacedCallback, picture_formats
+from .throttled import ThrottledCallback, picture_formats
 
 #: Frames a second at most: every frame of a faster environment would show nothing more.
 FRAMES_PER_SECOND = 25
@@ -22,7 +22,7 @@ FRAMES_PER_SECOND = 25
 LARGEST = 320
 
 
-class EpisodeVideoCallback(PacedCallback):
+class EpisodeVideoCallback(ThrottledCallback):
     """
     Records an episode of the greedy policy when training ends, and before that every ``video_freq`` calls, as an
     animated GIF: to TensorBoard's images under ``video/episode``, if the model logs there, and to ``folder``, if one is

@@ -1,4 +1,4 @@
-"""What a run was made with, beside what came of it."""
+"""The arguments of a run in TensorBoard, beside its results."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.logger import HParam
 
-from sb3_knntd.common.callback_dispatcher import PatientCallback
+from sb3_knntd.common.callback_dispatcher import BatchedCallback
 from sb3_knntd.common.checks import check_verbose, shown
 
-from .paced import picture_formats, write
+from .throttled import picture_formats, write
 
 METRICS = ("rollout/ep_rew_mean", "rollout/ep_len_mean", "train/td_error", "train/visited_points", "time/fps")
-#: What makes no two runs differ in what they learn.
+#: Arguments that do not change what is learned.
 LEFT_OUT = {"self", "policy", "env", "policy_kwargs", "tensorboard_log", "verbose", "device", "_init_setup_model"}
-#: Longer descriptions are cut off: they stand in a column of a table.
+#: Longer descriptions are cut: each is a column of a table.
 LONGEST = 60
 
 
-class HParamCallback(PatientCallback):
+class HParamCallback(BatchedCallback):
     """
-    Writes the arguments that the model was made with to TensorBoard's HParams, when training begins. The metrics beside
-    them are scalars that the run logs.
+    Writes the arguments of the model to TensorBoard's HParams when training begins. The metrics beside them are scalars
+    that the run logs.
 
     .. code-block:: python
 

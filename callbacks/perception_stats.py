@@ -1,4 +1,4 @@
-"""What the table sees and how it changes, as numbers."""
+"""Statistics of the perception and of the changes of the table."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gymnasium import spaces
 from sb3_knntd.common.checks import check_integer
 from sb3_knntd.kernels.step import UNDRAWN
 
-from .paced import PacedCallback
+from .throttled import ThrottledCallback
 
-#: Calls between two of which the transition is kept. A prime, lest it beat with the length of the episodes.
+#: Every so many calls a transition is sampled. A prime, so that it is no multiple of the length of the episodes.
 STRIDE = 101
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}
 
@@ -37,7 +37,7 @@ class Transitions(NamedTuple):
     terminated: np.ndarray
 
 
-class PerceptionStatsCallback(PacedCallback):
+class PerceptionStatsCallback(ThrottledCallback):
     """
     Logs how observations are seen and what learning does, from a sample of the transitions (one call in 102) and at
     training's end:

@@ -1,4 +1,4 @@
-"""Checkpoints that survive a crash, and what goes on from them."""
+"""Checkpoints that survive a crash, and training that continues from them."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from sb3_knntd.common.checks import check_flag, check_integer, check_name, check
 from sb3_knntd.common.files import read_description, replacing, sweep
 from sb3_knntd.common.plain import class_name, loaded_class
 
-from .paced import PacedCallback
+from .throttled import ThrottledCallback
 
-#: What a checkpoint has besides the model: names of the classes and the mean return, and what wrappers saved.
+#: The file in a checkpoint with the names of the classes and the mean return.
 NOTES = "checkpoint.json"
-#: What the notes were before they were JSON.
+#: The same in checkpoints of earlier versions.
 OLD_NOTES = "checkpoint.pkl"
-#: Bytes; they are a few hundred.
+#: In bytes; usually they are a few hundred.
 LARGEST_NOTES = 2**20
 WRAPPER = "vec_env_wrapper_{}.pkl"
 
 
-class TableCheckpointCallback(PacedCallback):
+class TableCheckpointCallback(ThrottledCallback):
     """
     Saves the model, with the statistics of VecNormalize and of any other VecEnvWrapper that has ``save`` and ``load``
     as it has, when training ends, and before that every ``save_freq`` calls. The last ones and the best are kept:
@@ -91,7 +91,7 @@ class TableCheckpointCallback(PacedCallback):
 
     def _init_callback(self) -> None:
         self.save_path.mkdir(parents=True, exist_ok=True)
-        # It may be long before there is a better one.
+        # Remove leftovers now: it may be long before there is a better one.
         sweep(self.best_path)
 
     def _on_training_start(self) -> None:
@@ -195,10 +195,10 @@ def _save(file: io.BufferedRandom, model: KNNAlgorithm, mean_reward: float | Non
 
 
 def _saveable_wrappers(venv: VecEnv | None) -> list[Any]:
-    """Those that can be saved and loaded as VecNormalize can, from the outside in."""
+    """The wrappers that can be saved and loaded like VecNormalize, the outermost first."""
     wrappers = []
     while isinstance(venv, VecEnvWrapper):
-        # On the class, as wrappers hand on what they do not have to what they wrap.
+        # Ask the class: a wrapper looks up missing attributes in the environment that it wraps.
         if all(callable(getattr(type(venv), name, None)) for name in ("save", "load")):
             wrappers.append(venv)
         venv = venv.venv
@@ -206,7 +206,7 @@ def _saveable_wrappers(venv: VecEnv | None) -> list[Any]:
 
 
 def _rewrap(venv: VecEnv, wrapper: type[Any], saved: str, trusted: bool) -> VecEnv:
-    """Load a wrapper from where it was saved, in the place of that of its class, or around everything."""
+    """Load a wrapper, in place of the wrapper of its class, or around all if there is none."""
     takes_trust = "trusted" in signature(wrapper.load).parameters
     if not (trusted or takes_trust):
         raise ValueError(
@@ -230,7 +230,7 @@ def _rewrap(venv: VecEnv, wrapper: type[Any], saved: str, trusted: bool) -> VecE
 
 
 class _Names(pickle.Unpickler):
-    """Reads what consists of names and numbers; nothing is imported or called."""
+    """Unpickles names and numbers only; nothing is imported or called."""
 
     def find_class(self, module: str, name: str) -> Any:
         """
@@ -251,7 +251,7 @@ def _read_notes(path: Path) -> dict[str, Any]:
         mean_reward = notes["mean_reward"]
         if not (mean_reward is None or isinstance(mean_reward, int | float)) or not isinstance(notes["wrappers"], list):
             raise ValueError(f"its notes are {notes!r}")
-    # Whatever a pickle that is none does to its reader.
+    # A damaged pickle can raise anything.
     except Exception as error:
         raise ValueError(f"{path} is no checkpoint, or was cut off: {error}") from error
     return notes

@@ -28,8 +28,8 @@ from sb3_knntd.plots import (
     value_grid,
 )
 
-from .footprints import Footprints, last_observation
-from .paced import PacedCallback, picture_formats, write
+from .throttled import ThrottledCallback, picture_formats, write
+from .visitation import Visitation, last_observation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,12 +40,11 @@ DPI = 100
 COLUMNS = 3
 
 
-class ValueMapCallback(PacedCallback):
+class ValueMapCallback(ThrottledCallback):
     """
     Draws over two dimensions of the observations: the value V(s) = max_a Q(s, a) with the ways that the last episodes
-    of the first environment took, the greedy action, and how often each place was visited since the callback is in use
-    (how many steps of all environments led there). A picture is drawn when training ends, and before that every
-    ``draw_freq`` calls.
+    of the first environment took, the greedy action, and how often each cell was visited by any environment since the
+    callback is in use. A picture is drawn when training ends, and before that every ``draw_freq`` calls.
 
     Pictures go to TensorBoard's images under ``map/value``, if the model logs there, and to ``folder``, if one is
     given.
@@ -93,10 +92,10 @@ class ValueMapCallback(PacedCallback):
         self.resolution = check_integer("resolution", resolution, 1, FINEST)
         self.folder = None if folder is None else check_path("folder", folder)
         self.names = check_names(names)
-        self._footprints = Footprints(self.dims, self.resolution, self.n_routes)
+        self._visitation = Visitation(self.dims, self.resolution, self.n_routes)
 
     def _init_callback(self) -> None:
-        # What does not fit or is not there is to be known before hours of training.
+        # Arguments that do not fit, and a missing matplotlib, must raise before hours of training.
         value_grid(self.model, self.dims, self.fixed, 1, self.average)
         names_for(self.model, self.names)
         new_figure(1.0, 1.0)
@@ -110,29 +109,29 @@ class ValueMapCallback(PacedCallback):
                 "folder='pictures'"
             )
         assert isinstance(self.model._last_obs, np.ndarray)
-        self._footprints.begin(self.model._last_obs)
+        self._visitation.start(self.model._last_obs)
         super()._on_training_start()
 
     def recorder(self) -> Callable[[np.ndarray], object]:
         """
-        :return: what takes the observations of every step
+        :return: a function that is given the observations of every step
         """
-        return self._footprints.recent.append
+        return self._visitation.recent.append
 
     def _on_step(self) -> bool:
         local = self.locals
         if local["dones"][0]:
-            self._footprints.end_route(last_observation(local["infos"], local["new_obs"]))
-        if self._footprints.room <= 0:
-            self._footprints.count(self._extent())
+            self._visitation.end_trajectory(last_observation(local["infos"], local["new_obs"]))
+        if self._visitation.free <= 0:
+            self._visitation.count(self._extent())
         return super()._on_step()
 
     def _next_due(self) -> int:
-        return min(super()._next_due(), self.n_calls + self._footprints.room)
+        return min(super()._next_due(), self.n_calls + self._visitation.free)
 
     def _on_training_end(self) -> None:
         super()._on_training_end()
-        self._footprints.count(self._extent())
+        self._visitation.count(self._extent())
 
     def _extent(self) -> tuple[float, float, float, float]:
         bounds = self.model.policy.perceiver.bounds
@@ -158,10 +157,10 @@ class ValueMapCallback(PacedCallback):
 
     def draw(self) -> Figure:
         """
-        :return: the picture as of now; save it with ``figure.savefig(path)``
+        :return: a picture of the model as it is now; save it with ``figure.savefig(path)``
         """
-        footprints = self._footprints
-        footprints.count(self._extent())
+        visitation = self._visitation
+        visitation.count(self._extent())
         names = names_for(self.model, self.names)
         n_panels = count_panels(self.model) + 1
         n_rows = -(-n_panels // COLUMNS)
@@ -173,12 +172,12 @@ class ValueMapCallback(PacedCallback):
         value_axes, *_ = plot_value_function(
             self.model, self.dims, self.fixed, self.resolution, panels[: n_panels - 1], names, self.average
         )
-        visits = plot_visits(footprints.counts, self._extent(), panels[n_panels - 1])
+        visits = plot_visits(visitation.counts, self._extent(), panels[n_panels - 1])
         visits.set_xlabel(names.observations[self.dims[0]])
-        plot_routes(list(footprints.routes), self.dims, value_axes)
+        plot_routes(list(visitation.trajectories), self.dims, value_axes)
         notes = [f"step {self.num_timesteps:,}"]
-        if footprints.routes:
-            n_routes = len(footprints.routes)
+        if visitation.trajectories:
+            n_routes = len(visitation.trajectories)
             notes.append(f"lines: the last {f'{n_routes} episodes' if n_routes > 1 else 'episode'}")
         notes.append(caption_of(value_grid(self.model, self.dims, self.fixed, 1, self.average), names))
         figure.suptitle(textwrap.fill("; ".join(filter(None, notes)), 150), fontsize="medium", color="0.3")

@@ -27,7 +27,7 @@ from stable_baselines3.common.utils import LinearSchedule, get_device
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_knntd.actions.selection import ActionRule
-from sb3_knntd.common.callback_dispatcher import Audience
+from sb3_knntd.common.callback_dispatcher import CallbackDispatcher
 from sb3_knntd.common.checks import (
     PROGRESS,
     check_finite,
@@ -420,11 +420,11 @@ class KNNAlgorithm(BaseAlgorithm):
         )
         self._measuring = self._must_measure()
         callback.on_training_start(locals(), globals())
-        audience = Audience(callback)
+        dispatcher = CallbackDispatcher(callback)
         while self.num_timesteps < total_timesteps:
-            if not self._step(audience, log_interval):
+            if not self._step(dispatcher, log_interval):
                 break
-        audience.catch_up(self.num_timesteps)
+        dispatcher.flush(self.num_timesteps)
         self.policy.set_training_mode(False)
         callback.on_training_end()
         return self
@@ -456,18 +456,18 @@ class KNNAlgorithm(BaseAlgorithm):
             self._current_progress_remaining = progress_remaining(self.num_timesteps, total_timesteps)
         return total_timesteps, callback
 
-    def _step(self, audience: Audience, log_interval: int | None) -> bool:
+    def _step(self, dispatcher: CallbackDispatcher, log_interval: int | None) -> bool:
         """
         One step in every environment, and what is learned from it.
 
-        :param audience: who is told
+        :param dispatcher: calls the callbacks
         :param log_interval: number of episodes between logs
         :return: whether to go on
         """
         env = self.env
         assert env is not None
-        for listener in audience.listeners:
-            listener.on_rollout_start()
+        for each in dispatcher.every_step:
+            each.on_rollout_start()
         last_obs = self._last_obs
         if last_obs is not self._standing:
             # A callback has moved the environments, or has given others, which need a reset if it did not say where.
@@ -518,10 +518,10 @@ class KNNAlgorithm(BaseAlgorithm):
             self._widen(new_obs)  # type: ignore[arg-type]
 
         # What is seen is handed on and not copied: SB3's algorithms hold on to what a VecEnv returned as well.
-        if audience.members and audience.hears(new_obs, any_ended):  # type: ignore[arg-type]
+        if dispatcher.callbacks and dispatcher.record_step(new_obs, any_ended):  # type: ignore[arg-type]
             self._acted_on = last_obs  # type: ignore[assignment]
             try:
-                go_on = audience.tell(locals(), self.num_timesteps)
+                go_on = dispatcher.dispatch(locals(), self.num_timesteps, any_ended)
             finally:
                 self._move_on()
                 self._acted_on = None
@@ -531,8 +531,8 @@ class KNNAlgorithm(BaseAlgorithm):
             self._last_obs = new_obs  # type: ignore[assignment]
         if n_logs:
             self.dump_logs()
-        for listener in audience.listeners:
-            listener.on_rollout_end()
+        for each in dispatcher.every_step:
+            each.on_rollout_end()
         return True
 
     def _move_on(self) -> None:

@@ -164,7 +164,7 @@ def test_all_together_change_nothing_that_is_learned(tmp_path: pathlib.Path, nam
 )
 def test_another_algorithm_is_refused(tmp_path: pathlib.Path, make: Callable[..., BaseCallback]) -> None:
     dqn = DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]})
-    with pytest.raises(ValueError, match="looks into KNNTD and ExA; got a DQN"):
+    with pytest.raises(ValueError, match="needs a model of KNNTD or ExA; got a DQN"):
         dqn.learn(10, callback=make(tmp_path))
 
 
@@ -269,7 +269,7 @@ class Undrawn(ValueMapCallback):
     """Counts when it should draw, which takes a thousandth of the time."""
 
     def _act(self) -> None:
-        self._footprints.count(self._extent())
+        self._visitation.count(self._extent())
 
 
 @pytest.mark.parametrize(("n_envs", "n_steps"), [(1, 200), (1, 2500), (3, 1500)])
@@ -286,7 +286,7 @@ def test_visits_and_routes_are_where_the_environments_were(
     after = [step.observations for step in steps[1:]] + [venv._shown]
     places = np.concatenate(after)
     expected, *_ = np.histogram2d(places[:, 1], places[:, 0], bins=7, range=((low[1], high[1]), (low[0], high[0])))
-    np.testing.assert_array_equal(callback._footprints.counts, expected)
+    np.testing.assert_array_equal(callback._visitation.counts, expected)
     assert expected.sum() < n_steps
 
     routes: list[list[np.ndarray]] = [[]]
@@ -295,8 +295,8 @@ def test_visits_and_routes_are_where_the_environments_were(
         if step.terminated[0] or step.truncated[0]:
             routes[-1].append(step.arrived[0])
             routes.append([])
-    assert len(callback._footprints.routes) == 2
-    for drawn, was in zip(callback._footprints.routes, routes[-3:-1], strict=True):
+    assert len(callback._visitation.trajectories) == 2
+    for drawn, was in zip(callback._visitation.trajectories, routes[-3:-1], strict=True):
         np.testing.assert_array_equal(drawn, was)
 
 
@@ -304,20 +304,20 @@ def test_visits_go_on_in_another_learn(make_model: MakeModel, tmp_path: pathlib.
     callback = Undrawn(folder=tmp_path, resolution=3)
     model = make_model(bounds=([-50.0, -50.0], [50.0, 50.0]))
     model.learn(70, callback=callback)
-    assert callback._footprints.counts.sum() == 70
+    assert callback._visitation.counts.sum() == 70
     model.learn(50, callback=callback, reset_num_timesteps=False)
-    assert callback._footprints.counts.sum() == 120
+    assert callback._visitation.counts.sum() == 120
 
 
 def test_a_long_episode_is_drawn_from_its_last_part(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
-    from sb3_knntd.callbacks.footprints import BUFFERED, LONGEST_ROUTE
+    from sb3_knntd.callbacks.visitation import BUFFERED, MAX_CHUNKS
 
-    env = DriftEnv(lengths=[BUFFERED * (LONGEST_ROUTE + 3)], ends=["terminated"])
+    env = DriftEnv(lengths=[BUFFERED * (MAX_CHUNKS + 3)], ends=["terminated"])
     env = DummyVecEnv([lambda: env])  # type: ignore[assignment]
     callback = Undrawn(folder=tmp_path, resolution=3)
-    make_model(env, bounds=([-3.0, -3.0], [3.0, 3.0])).learn(BUFFERED * (LONGEST_ROUTE + 3), callback=callback)
-    (route,) = callback._footprints.routes
-    assert BUFFERED * (LONGEST_ROUTE - 1) <= len(route) <= BUFFERED * (LONGEST_ROUTE + 1) + 1
+    make_model(env, bounds=([-3.0, -3.0], [3.0, 3.0])).learn(BUFFERED * (MAX_CHUNKS + 3), callback=callback)
+    (route,) = callback._visitation.trajectories
+    assert BUFFERED * (MAX_CHUNKS - 1) <= len(route) <= BUFFERED * (MAX_CHUNKS + 1) + 1
 
 
 def test_visits_move_over_when_the_range_changes(tmp_path: pathlib.Path) -> None:
@@ -325,23 +325,23 @@ def test_visits_move_over_when_the_range_changes(tmp_path: pathlib.Path) -> None
     callback = Undrawn(dims=(1, 3), draw_freq=900, folder=tmp_path, resolution=10)
     model.learn(2048, callback=callback)
     low, high = (bound.tolist() for bound in (model.policy.perceiver.bounds.low, model.policy.perceiver.bounds.high))
-    assert callback._footprints._extent == callback._extent() == (low[1], high[1], low[3], high[3])
+    assert callback._visitation._extent == callback._extent() == (low[1], high[1], low[3], high[3])
     # Up to the count at 900 the range was not known, and what was beyond ±1 was in no cell.
-    assert 1148 < callback._footprints.counts.sum() <= 2048
+    assert 1148 < callback._visitation.counts.sum() <= 2048
 
 
 def test_visits_keep_their_places_when_the_range_widens() -> None:
-    from sb3_knntd.callbacks.footprints import Footprints
+    from sb3_knntd.callbacks.visitation import Visitation
 
-    footprints = Footprints((0, 1), resolution=4, n_routes=1)
-    footprints.begin(np.zeros((1, 2), np.float32))
+    visitation = Visitation((0, 1), resolution=4, n_trajectories=1)
+    visitation.start(np.zeros((1, 2), np.float32))
     for place in ([0.1, 0.1], [0.9, 0.1], [0.9, 0.1], [1.0, 1.0]):
-        footprints.recent.append(np.array([place], np.float32))
-    footprints.count((0.0, 1.0, 0.0, 1.0))
-    np.testing.assert_array_equal(footprints.counts, [[1, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]])
-    footprints.recent.append(np.array([[-1.0, 0.6]], np.float32))
-    footprints.count((-1.0, 1.0, 0.0, 1.0))
-    np.testing.assert_array_equal(footprints.counts, [[0, 0, 1, 2], [0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+        visitation.recent.append(np.array([place], np.float32))
+    visitation.count((0.0, 1.0, 0.0, 1.0))
+    np.testing.assert_array_equal(visitation.counts, [[1, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]])
+    visitation.recent.append(np.array([[-1.0, 0.6]], np.float32))
+    visitation.count((-1.0, 1.0, 0.0, 1.0))
+    np.testing.assert_array_equal(visitation.counts, [[0, 0, 1, 2], [0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 def test_the_map_shows_the_model(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
@@ -351,10 +351,10 @@ def test_the_map_shows_the_model(make_model: MakeModel, tmp_path: pathlib.Path) 
     grid = value_grid(model, resolution=12)
     np.testing.assert_array_equal(value.images[0].get_array(), np.ma.masked_where(~grid.learned, grid.values))
     np.testing.assert_array_equal(action.images[0].get_array(), np.ma.masked_where(~grid.learned, grid.actions))
-    np.testing.assert_array_equal(visits.images[0].get_array().filled(0), callback._footprints.counts)
+    np.testing.assert_array_equal(visits.images[0].get_array().filled(0), callback._visitation.counts)
     # A line, a circle and a cross for each of three episodes.
     assert len(value.lines) == 9
-    latest = callback._footprints.routes[-1]
+    latest = callback._visitation.trajectories[-1]
     np.testing.assert_array_equal(value.lines[0].get_xydata(), latest)
     assert figure_of(value).get_suptitle() == "step 300; lines: the last 3 episodes"
 

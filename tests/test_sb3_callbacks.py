@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from toy_envs import DriftEnv, RecordingVecEnv
 
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.common.callback_dispatcher import PatientCallback
+from sb3_knntd.common.callback_dispatcher import BatchedCallback
 
 Algorithm = type[KNNTD | ExA]
 MakeModel = Callable[..., KNNTD | ExA]
@@ -198,10 +198,10 @@ def test_lists_of_callbacks_count_as_their_members_do(make_model: MakeModel, mak
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_lists_count_where_nobody_is_told_of_every_step(
+def test_lists_count_where_no_callback_is_called_at_every_step(
     make_model: MakeModel, make_venv: MakeVenv, n_envs: int
 ) -> None:
-    class Patient(PatientCallback):
+    class Batched(BatchedCallback):
         def _on_training_start(self) -> None:
             self.due_at = 1000
 
@@ -209,7 +209,7 @@ def test_lists_count_where_nobody_is_told_of_every_step(
             assert (outer.n_calls, outer.num_timesteps) == (self.n_calls, self.num_timesteps)
             return True
 
-    outer = CallbackList([Patient()])
+    outer = CallbackList([Batched()])
     empty = CallbackList([])
     make_model(make_venv(n_envs)).learn(20 * n_envs, callback=outer)
     make_model(make_venv(n_envs)).learn(20 * n_envs, callback=empty)

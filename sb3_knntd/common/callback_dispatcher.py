@@ -1,4 +1,4 @@
-"""Who is told of the steps of learning."""
+"""When which callbacks are called during training."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 
 
-class PatientCallback(BaseCallback):
+class BatchedCallback(BaseCallback):
     """
-    A callback that KNNTD and ExA tell of many steps at once: to tell one of every step takes a hundredth of the time.
-    It is told when it is due, and when an episode ends; then ``n_calls``, ``num_timesteps`` and ``locals`` are those of
-    the last step, as they always are with other algorithms and beneath other callbacks.
+    A callback that KNNTD and ExA call once for many steps, which takes a hundredth of the time of calling it at every
+    step. It is called when it is due and when an episode ends. ``n_calls``, ``num_timesteps`` and ``locals`` are then
+    those of the last step, as with other algorithms or below other callbacks.
     """
 
-    #: the call at which it wants to be told next, to be set when training begins and whenever it is told
+    #: the value of ``n_calls`` at which it is due; set it when training begins and in each call
     due_at: int
 
     def recorder(self) -> Callable[[np.ndarray], object] | None:
         """
-        :return: what takes the observations of every step, shape (n_envs, *obs_shape); ``None`` for nothing
+        :return: a function that is given the observations of every step, shape (n_envs, *obs_shape); ``None`` if no
+            observations are needed
         """
         return None
 
@@ -34,7 +35,7 @@ class PatientCallback(BaseCallback):
 
     def on_step(self) -> bool:
         """
-        :return: whether to go on
+        :return: whether training continues
         """
         record = self.recorder()
         if record is not None:
@@ -42,83 +43,86 @@ class PatientCallback(BaseCallback):
         return super().on_step()
 
 
-class Audience:
+class CallbackDispatcher:
     """
-    The callbacks of one training.
+    Calls the callbacks of one training: SB3's at every step, batched ones when they are due.
 
-    :param callback: SB3's, which may be lists of others
+    :param callback: SB3's callback, which may be a list of others
     """
 
     def __init__(self, callback: BaseCallback) -> None:
-        #: all of them, and the lists that they are in
-        self.members = list(_members(callback))
-        lists = [member for member in self.members if type(member) is CallbackList]
-        self._patient = [member for member in self.members if isinstance(member, PatientCallback)]
-        self._recorders = [record for member in self._patient if (record := member.recorder()) is not None]
-        #: those who are told of every step
-        self.listeners = [member for member in self.members if member not in [*self._patient, *lists]]
-        self._any_listens = bool(self.listeners)
-        # Lists only count, at every step if one of their members may look.
-        self._counting_each_step = lists if self._any_listens else []
-        self._catching_up = [*self._patient, *([] if self._any_listens else lists)]
-        self._n_untold = 0
-        self._patience = self._wait()
+        #: all callbacks, and the lists that hold them
+        self.callbacks = list(_flatten(callback))
+        lists = [each for each in self.callbacks if type(each) is CallbackList]
+        self._batched = [each for each in self.callbacks if isinstance(each, BatchedCallback)]
+        self._recorders = [record for each in self._batched if (record := each.recorder()) is not None]
+        #: the callbacks that are called at every step
+        self.every_step = [each for each in self.callbacks if each not in [*self._batched, *lists]]
+        self._any_every_step = bool(self.every_step)
+        # Lists only count steps; a callback that is called at every step may read their counts.
+        self._lists = lists if self._any_every_step else []
+        self._counted_late = [*self._batched, *([] if self._any_every_step else lists)]
+        self._n_pending = 0
+        self._due_in = self._next_due()
 
-    def hears(self, observations: np.ndarray, any_ended: bool) -> bool:
+    def record_step(self, observations: np.ndarray, any_ended: bool) -> bool:
         """
-        Note a step.
+        Record a step. It is called at every step, and must be cheap.
 
-        :param observations: what it led to, shape (n_envs, *obs_shape)
-        :param any_ended: whether it ended an episode
-        :return: whether somebody is to be told of it
+        :param observations: the observations after the step, shape (n_envs, *obs_shape)
+        :param any_ended: whether an episode ended
+        :return: whether :meth:`dispatch` must be called for this step
         """
         for record in self._recorders:
             record(observations)
-        self._n_untold += 1
-        return self._any_listens or any_ended or self._n_untold >= self._patience
+        self._n_pending += 1
+        return self._any_every_step or any_ended or self._n_pending >= self._due_in
 
-    def tell(self, locals_: dict[str, Any], num_timesteps: int) -> bool:
+    def dispatch(self, locals_: dict[str, Any], num_timesteps: int, any_ended: bool) -> bool:
         """
-        :param locals_: local variables of the step, ``any_ended`` among them
+        Call the callbacks that are due.
+
+        :param locals_: local variables of the step, which callbacks read
         :param num_timesteps: number of environment steps
-        :return: whether to go on
+        :param any_ended: whether an episode ended
+        :return: whether training continues
         """
         go_on = True
-        for each in self._counting_each_step:
+        for each in self._lists:
             each.n_calls += 1
             each.num_timesteps = num_timesteps
-        for listener in self.listeners:
-            listener.update_locals(locals_)
-            go_on = listener.on_step() and go_on
-        if locals_["any_ended"] or self._n_untold >= self._patience:
-            self.catch_up(num_timesteps)
-            for patient in self._patient:
-                if locals_["any_ended"] or patient.n_calls >= patient.due_at:
-                    patient.update_locals(locals_)
-                    go_on = patient._on_step() and go_on
-            self._patience = self._wait()
+        for callback in self.every_step:
+            callback.update_locals(locals_)
+            go_on = callback.on_step() and go_on
+        if any_ended or self._n_pending >= self._due_in:
+            self.flush(num_timesteps)
+            for batched in self._batched:
+                if any_ended or batched.n_calls >= batched.due_at:
+                    batched.update_locals(locals_)
+                    go_on = batched._on_step() and go_on
+            self._due_in = self._next_due()
         return go_on
 
-    def catch_up(self, num_timesteps: int) -> None:
+    def flush(self, num_timesteps: int) -> None:
         """
-        Let those count the steps who were not told of them.
+        Add the recorded steps to the counts of the callbacks that were not called at them.
 
         :param num_timesteps: number of environment steps
         """
-        for each in self._catching_up:
-            each.n_calls += self._n_untold
+        for each in self._counted_late:
+            each.n_calls += self._n_pending
             each.num_timesteps = num_timesteps
-        self._n_untold = 0
+        self._n_pending = 0
 
-    def _wait(self) -> int:
-        """After how many steps the first of them is due."""
-        return min([patient.due_at - patient.n_calls for patient in self._patient], default=sys.maxsize)
+    def _next_due(self) -> int:
+        """The number of steps until the first batched callback is due."""
+        return min([batched.due_at - batched.n_calls for batched in self._batched], default=sys.maxsize)
 
 
-def _members(callback: BaseCallback) -> Iterator[BaseCallback]:
-    """The callback and, if it is a list, all that are in it, but for the one that stands for none."""
+def _flatten(callback: BaseCallback) -> Iterator[BaseCallback]:
+    """The callback and, if it is a list, all in it, without SB3's placeholder for no callback."""
     if not (isinstance(callback, ConvertCallback) and callback.callback is None):
         yield callback
     if type(callback) is CallbackList:
         for each in callback.callbacks:
-            yield from _members(each)
+            yield from _flatten(each)

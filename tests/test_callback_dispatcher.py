@@ -1,4 +1,4 @@
-"""Who is told of the steps of learning: SB3's callbacks of every one, patient ones of those that they wait for."""
+"""SB3's callbacks are called at every step, batched ones when they are due."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Every
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd import KNNTD
-from sb3_knntd.common.callback_dispatcher import PatientCallback
+from sb3_knntd.common.callback_dispatcher import BatchedCallback, CallbackDispatcher
 
 
-class Waiting(PatientCallback):
-    """Notes when it is told, and what it sees then."""
+class Waiting(BatchedCallback):
+    """Records when it is called, and with which observations."""
 
     def __init__(self, every: int) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ def expected(ends: list[int], every: int, n_calls: int) -> list[int]:
 
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize("beside", [False, True])
-def test_a_patient_callback_is_told_when_due_and_when_episodes_end(
+def test_a_batched_callback_is_called_when_due_and_when_episodes_end(
     make_model: Callable[..., KNNTD], make_venv: Callable[..., VecEnv], n_envs: int, beside: bool
 ) -> None:
     finding = Listening()
@@ -113,7 +113,7 @@ def test_training_ends_when_one_says_so(make_model: Callable[..., KNNTD]) -> Non
         assert all(callback.n_calls == 20 for callback in callbacks)
 
 
-def test_beneath_another_callback_it_is_told_whenever_that_one_tells(make_model: Callable[..., KNNTD]) -> None:
+def test_below_another_callback_it_is_called_whenever_that_one_calls(make_model: Callable[..., KNNTD]) -> None:
     callback = Waiting(1000)
     make_model().learn(100, callback=EveryNTimesteps(25, callback))
     assert [told[:2] for told in callback.told] == [(1, 25), (2, 50), (3, 75), (4, 100)]
@@ -123,3 +123,23 @@ def test_beneath_another_callback_it_is_told_whenever_that_one_tells(make_model:
 @pytest.mark.parametrize("callback", [None, [], CallbackList([]), [CallbackList([])]])
 def test_nobody_listens(make_model: Callable[..., KNNTD], callback: Any) -> None:
     assert make_model().learn(50, callback=callback).num_timesteps == 50
+
+
+def test_the_locals_of_a_step_may_have_any_names() -> None:
+    class Recording(BatchedCallback):
+        due_at = 100
+
+        def _on_step(self) -> bool:
+            calls.append((self.n_calls, self.num_timesteps, self.locals["infos"]))
+            return True
+
+    calls: list[tuple[int, int, str]] = []
+    dispatcher = CallbackDispatcher(Recording())
+    observations = np.zeros((2, 3))
+    assert not dispatcher.record_step(observations, any_ended=False)
+    assert dispatcher.record_step(observations, any_ended=True)
+    assert dispatcher.dispatch({"infos": "of an end"}, 4, any_ended=True)
+    assert not dispatcher.record_step(observations, any_ended=False)
+    dispatcher.flush(6)
+    assert calls == [(2, 4, "of an end")]
+    assert (dispatcher.callbacks[0].n_calls, dispatcher.callbacks[0].num_timesteps) == (3, 6)

@@ -1,4 +1,4 @@
-"""Where the environments have been."""
+"""Visit counts and trajectories of the environments."""
 
 from __future__ import annotations
 
@@ -8,55 +8,55 @@ from typing import Any
 
 import numpy as np
 
-#: Steps kept before they are counted: counting many at once takes a hundredth of the time.
+#: Steps that are buffered: counting many at once takes a hundredth of the time.
 BUFFERED = 1024
-#: Of a longer episode the last so many times that are kept.
-LONGEST_ROUTE = 10
+#: Of a longer trajectory this many of the last buffers are kept.
+MAX_CHUNKS = 10
 
 Extent = tuple[float, float, float, float]
 
 
-class Footprints:
+class Visitation:
     """
-    How often steps of any environment led to each cell of two dimensions, and the ways that the last episodes of the
-    first environment took.
+    Counts how often each cell of a grid over two dimensions is visited by any environment, and keeps the trajectories
+    of the last episodes of the first environment.
 
     :param dims: the two dimensions, of the columns and of the rows
     :param resolution: number of cells in each
-    :param n_routes: how many episodes are kept
+    :param n_trajectories: number of trajectories that are kept
     """
 
-    def __init__(self, dims: tuple[int, int], resolution: int, n_routes: int) -> None:
+    def __init__(self, dims: tuple[int, int], resolution: int, n_trajectories: int) -> None:
         self.dims = dims
         #: visits of each cell, shape (resolution, resolution), rows from bottom up
         self.counts = np.zeros((resolution, resolution), np.int64)
-        #: observations of the episodes that have ended, the last one among them, shape (n_steps, obs_dim), latest last
-        self.routes: deque[np.ndarray] = deque(maxlen=n_routes)
-        #: what the environments showed after each step since :meth:`count`, shape (n_envs, obs_dim); to be appended to
+        #: observations of each finished episode with its last one, shape (n_steps, obs_dim), the latest episode last
+        self.trajectories: deque[np.ndarray] = deque(maxlen=n_trajectories)
+        #: append the observations after each step here, shape (n_envs, obs_dim); :meth:`count` empties it
         self.recent: list[np.ndarray] = []
         self._ends: list[tuple[int, np.ndarray]] = []
-        self._route: deque[np.ndarray] = deque(maxlen=LONGEST_ROUTE)
+        self._trajectory: deque[np.ndarray] = deque(maxlen=MAX_CHUNKS)
         self._extent: Extent | None = None
 
     @property
-    def room(self) -> int:
-        """How many steps may be appended before :meth:`count` ought to be called."""
+    def free(self) -> int:
+        """Number of steps that may be appended before :meth:`count` must be called."""
         return BUFFERED - len(self.recent)
 
-    def begin(self, observations: np.ndarray) -> None:
+    def start(self, observations: np.ndarray) -> None:
         """
-        Training begins, with a new route. What waits to be counted of one that was broken off is forgotten.
+        Start a new trajectory at the beginning of training, and drop what an interrupted training left in the buffer.
 
-        :param observations: where the environments are, shape (n_envs, obs_dim)
+        :param observations: the current observations, shape (n_envs, obs_dim)
         """
         self.recent.clear()
         self._ends.clear()
-        self._route.clear()
-        self._route.append(observations[:1])
+        self._trajectory.clear()
+        self._trajectory.append(observations[:1])
 
-    def end_route(self, last_observation: np.ndarray) -> None:
+    def end_trajectory(self, last_observation: np.ndarray) -> None:
         """
-        The episode of the first environment has ended with the step that was appended last.
+        End the trajectory: the first environment's episode ended with the step that was appended last.
 
         :param last_observation: the last of the episode, shape (obs_dim,)
         """
@@ -64,33 +64,35 @@ class Footprints:
 
     def count(self, extent: Extent) -> None:
         """
-        Count what was appended since. If the range has changed, what was counted moves over, cell by cell.
+        Count the steps in the buffer. If the range has changed, the earlier counts are moved to the new cells first.
 
-        :param extent: (left, right, bottom, top), the range of the cells
+        :param extent: (left, right, bottom, top), the range of the grid, observation units
         """
         if self._extent not in (None, extent):
-            self._move_to(extent)
+            self._regrid(extent)
         self._extent = extent
         if not self.recent:
             return
         # What np.stack does, in a third of its time.
         observations = np.concatenate(self.recent).reshape(len(self.recent), *self.recent[0].shape)
-        self._follow(observations[:, 0])
+        self._cut(observations[:, 0])
         places = observations[..., list(self.dims)].reshape(-1, 2)
         self.counts += self._histogram(places, np.ones(len(places), np.int64), extent)
         self.recent.clear()
 
-    def _follow(self, observations: np.ndarray) -> None:
+    def _cut(self, observations: np.ndarray) -> None:
         """Cut the first environment's observations, shape (n_steps, obs_dim), where its episodes ended."""
         start = 0
         for end, last_observation in self._ends:
-            self.routes.append(np.concatenate([*self._route, observations[start:end], last_observation[None]]))
-            self._route.clear()
+            self.trajectories.append(
+                np.concatenate([*self._trajectory, observations[start:end], last_observation[None]])
+            )
+            self._trajectory.clear()
             start = end
-        self._route.append(observations[start:].copy())
+        self._trajectory.append(observations[start:].copy())
         self._ends.clear()
 
-    def _move_to(self, extent: Extent) -> None:
+    def _regrid(self, extent: Extent) -> None:
         assert self._extent is not None
         left, right, bottom, top = self._extent
         middles = (np.arange(len(self.counts)) + 0.5) / len(self.counts)
@@ -99,9 +101,9 @@ class Footprints:
         self.counts = self._histogram(places, self.counts.reshape(-1), extent)
 
     def _histogram(self, places: np.ndarray, numbers: np.ndarray, extent: Extent) -> np.ndarray:
-        """How many fall into each cell; those at places outside fall into none."""
+        """The sum of ``numbers`` in each cell; places outside the grid are not counted."""
         left, right, bottom, top = extent
-        # As observations mostly are: the float32 next to a bound is not beyond it.
+        # Most observations are float32, and the float32 nearest to a bound counts as inside.
         places = places.astype(np.float32)
         low, high = np.array([left, bottom], np.float32), np.array([right, top], np.float32)
         inside = ((places >= low) & (places <= high)).all(axis=1)

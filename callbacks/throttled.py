@@ -1,4 +1,4 @@
-"""When to do what takes longer than a step."""
+"""Callbacks that act seldom, because acting takes longer than a step."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ from typing import Any, ClassVar
 from stable_baselines3.common.logger import CSVOutputFormat, HumanOutputFormat, JSONOutputFormat, KVWriter, Logger
 
 from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.common.callback_dispatcher import PatientCallback
+from sb3_knntd.common.callback_dispatcher import BatchedCallback
 from sb3_knntd.common.checks import check_integer, check_verbose
 
-#: ``freq=None``: calls between two looks at the clock.
-CALLS_BETWEEN_LOOKS = 128
+#: ``freq=None``: number of calls after which the clock is read.
+CALLS_PER_CLOCK_READ = 128
 
 
-class PacedCallback(PatientCallback):
+class ThrottledCallback(BatchedCallback):
     """
-    Acts now and then, and when training ends.
+    Acts every ``freq`` calls, or as often as a share of the time allows, and when training ends.
 
     :param name: name of the argument that ``freq`` was given as
-    :param freq: act every ``freq`` calls (of n_envs steps each); ``None``: as often as takes :attr:`SHARE` of the time
+    :param freq: act every ``freq`` calls (of n_envs steps each); ``None``: as often as acting takes :attr:`SHARE` of
+        the time
     :param verbose: 0 for no output, 1 for a line whenever a file is written
     :raises ValueError: if ``freq`` is neither ``None`` nor an integer >= 1, or ``verbose`` does not fit
     """
 
     model: KNNAlgorithm
 
-    #: ``freq=None``: the share of the time that is spent on acting.
+    #: ``freq=None``: the share of the training time that acting may take.
     SHARE: ClassVar[float] = 0.001
-    #: Seconds that the first act is taken to last.
+    #: ``freq=None``: seconds that acting is assumed to take the first time.
     FIRST_SECONDS: ClassVar[float]
 
     def __init__(self, name: str, freq: int | None, verbose: int) -> None:
@@ -40,10 +41,10 @@ class PacedCallback(PatientCallback):
     def init_callback(self, model: Any) -> None:
         """
         :param model: the model that is about to learn
-        :raises ValueError: if it is none of this package
+        :raises ValueError: if it is not a model of this package
         """
         if not isinstance(model, KNNAlgorithm):
-            raise ValueError(f"{type(self).__name__} looks into KNNTD and ExA; got a {type(model).__name__}")
+            raise ValueError(f"{type(self).__name__} needs a model of KNNTD or ExA; got a {type(model).__name__}")
         super().init_callback(model)
 
     def _on_training_start(self) -> None:
@@ -69,8 +70,8 @@ class PacedCallback(PatientCallback):
         return self.n_calls % self.freq == 0
 
     def _next_due(self) -> int:
-        """The next call at which there may be something to do."""
-        return self.n_calls + (CALLS_BETWEEN_LOOKS if self.freq is None else self.freq - self.n_calls % self.freq)
+        """The next call at which it may be time to act."""
+        return self.n_calls + (CALLS_PER_CLOCK_READ if self.freq is None else self.freq - self.n_calls % self.freq)
 
     def _on_training_end(self) -> None:
         if self.n_calls > self._acted_at:
@@ -79,13 +80,13 @@ class PacedCallback(PatientCallback):
 
     @abstractmethod
     def _act(self) -> None:
-        """Do what takes longer than a step."""
+        """Do what this callback is for."""
 
 
 def picture_formats(logger: Logger) -> list[KVWriter]:
     """
     :param logger: SB3's
-    :return: those of its outputs that take more than text: TensorBoard, and what others have made
+    :return: its outputs that can show pictures: TensorBoard, and outputs defined elsewhere
     """
     text = HumanOutputFormat, JSONOutputFormat, CSVOutputFormat
     return [output for output in logger.output_formats if not isinstance(output, text)]
@@ -93,10 +94,10 @@ def picture_formats(logger: Logger) -> list[KVWriter]:
 
 def write(outputs: list[KVWriter], key: str, value: Any, step: int) -> None:
     """
-    Write one value at once, in place of when the algorithm next does: it is what is true at this step.
+    Write one value now, not with the next log of the algorithm, since it belongs to this step.
 
     :param outputs: of :func:`picture_formats`
-    :param key: the name it is shown under
+    :param key: its key in the log
     :param value: a number, or SB3's ``Image`` or ``HParam``
     :param step: number of environment steps
     """
