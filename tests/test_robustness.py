@@ -410,7 +410,7 @@ def test_exploration_unknown_to_the_compiled_step(monkeypatch: pytest.MonkeyPatc
 
 
 def test_weights_unknown_to_the_compiled_step() -> None:
-    with pytest.raises(TypeError, match="Other.WEIGHTING"):
+    with pytest.raises(TypeError, match=r"Other\.WEIGHTING"):
 
         class Other(Gaussian):
             """Not the one that is compiled."""

@@ -231,50 +231,9 @@ class MeanValueSelector(ActionSelector):
         # Inherited, the code would have the kernels explore as the parent class does.
         if not greedy and "CODE" not in vars(type(self.policy)):
             raise ValueError(
-                f"the compiled step does
-                not know the exploration {type(self.policy).__name__}: its CODE must be set in " "the class itself, to a
-                member of Exploration
-                that the kernels
-                implement. Without it,
-                give
-               
-               
-               
-               
-               
-               
-               
-                "
-               
-               
-               
-               
-               
-               
-               
-               
-                "policy_kwargs={'compiled':
-               
-               
-               
-               
-               
-               
-               
-               
-               
-                False}"
-           
-           
-           
-           
-           
-           
-           
-           
-           
-           
-           
+                f"the compiled step does not know the exploration {type(self.policy).__name__}: its CODE must be set "
+                "in the class itself, to a member of Exploration that the kernels implement. Without it, give "
+                "policy_kwargs={'compiled': False}"
             )
         return super().kernel_arguments(greedy)
 
@@ -315,21 +274,10 @@ class MeanValueSelector(ActionSelector):
         return mean_rows(rows, probabilities).amax(dim=1)
 
 
-
-
-
-c cl
-cla clas
-class
-MeanActionSelector(ActionSelector) MeanActionSelector(ActionSelector)
-MeanActionSelector(ActionSelector) MeanActionSelector(ActionSelector)
-MeanActionSelector(ActionSelector) MeanActionSelector(ActionSelector)
-MeanActionSelector(ActionSelector) MeanActionSelector(ActionSelector)
-MeanActionSelector(ActionSelector) MeanActionSelector(ActionSelector)
-MeanActionSelector(ActionSelector):
-   
-    """ Ex⟨a⟩: each neighbour selects the best action of its own row, and the
-    mean of these actions is taken (eqs. 19 to 21). The state is worth the mean of the neighbours' best values (eq. 25).
+class MeanActionSelector(ActionSelector):
+    """
+    Ex⟨a⟩: each neighbour selects the best action of its own row, and the mean of these actions is taken (eqs. 19 to
+    21). The state is worth the mean of the neighbours' best values (eq. 25).
 
     :param columns: the action points, in columns for each action factor
     :param exploration: ``SHARED``: all neighbours explore the same column; ``PER_NEIGHBOR``: each by itself (eq. 27)
