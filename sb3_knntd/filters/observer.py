@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import torch as th
 
-from sb3_knntd.common.transitions import check_finite
+from sb3_knntd.common.checks import check_finite
 from sb3_knntd.filters.table import DeltaTable
 from sb3_knntd.kernels import delta_filter as kernel
 from sb3_knntd.kernels import jit

@@ -12,8 +12,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_knntd.common.checks import check_flag
-from sb3_knntd.common.transitions import check_finite
+from sb3_knntd.common.checks import check_finite, check_flag
 from sb3_knntd.filters.observer import Observer
 from sb3_knntd.filters.saving import load_table, save_table
 from sb3_knntd.filters.table import DeltaTable, FilterArguments
