@@ -333,7 +333,7 @@ def test_visits_move_over_when_the_range_changes(tmp_path: pathlib.Path) -> None
 def test_visits_keep_their_places_when_the_range_widens() -> None:
     from sb3_knntd.callbacks.visitation import Visitation
 
-    visitation = Visitation((0, 1), resolution=4, n_routes=1)
+    visitation = Visitation((0, 1), resolution=4, n_trajectories=1)
     visitation.start(np.zeros((1, 2), np.float32))
     for place in ([0.1, 0.1], [0.9, 0.1], [0.9, 0.1], [1.0, 1.0]):
         visitation.recent.append(np.array([place], np.float32))

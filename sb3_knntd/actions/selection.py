@@ -227,6 +227,16 @@ class MeanValueSelector(ActionSelector):
         self.exploration = exploration.CODE
         self.n_uniforms = exploration.N_UNIFORMS
 
+    def kernel_arguments(self, greedy: bool = False) -> SelectionArguments:
+        # Inherited, the code would have the kernels explore as the parent class does.
+        if not greedy and "CODE" not in vars(type(self.policy)):
+            raise ValueError(
+                f"the compiled step does not know the exploration {type(self.policy).__name__}: its CODE must be set "
+                "in the class itself, to a member of Exploration that the kernels implement. Without it, give "
+                "policy_kwargs={'compiled': False}"
+            )
+        return super().kernel_arguments(greedy)
+
     def select(
         self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, persistent: th.Tensor
     ) -> Selection:

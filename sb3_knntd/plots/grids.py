@@ -1,0 +1,223 @@
+"""Values and greedy actions of a model on a grid over two dimensions of the observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_knntd.actions.selection import mean_rows
+from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.common.checks import check_integer, check_number, shown
+
+#: The largest resolution of a grid; a picture has fewer dots.
+FINEST = 4096
+#: Number of observations in a batch. With thousands of points a larger batch would take gigabytes.
+BATCH = 512
+#: Number of places in the other dimensions that are averaged over.
+AVERAGED_PLACES = 32
+
+
+class ValueGrid(NamedTuple):
+    """
+    Values and greedy actions of a model on a grid over two dimensions of the observations.
+
+    :param dims: the two dimensions, of the columns and of the rows
+    :param extent: (left, right, bottom, top), the range of the two dimensions, observation units
+    :param fixed: where other dimensions are held, observation units
+    :param averaged: the dimensions that are averaged over
+    :param q_values: at the middle of each cell, shape (resolution, resolution, n_actions), rows from bottom up
+    :param values: V(s), shape (resolution, resolution)
+    :param actions: the greedy action, shape (resolution, resolution), int64, counted from 0; of ExA its mean, shape
+        (resolution, resolution, action_dim), action units
+    :param learned: whether an entry of the k nearest points differs from the initial value,
+        shape (resolution, resolution)
+    """
+
+    dims: tuple[int, int]
+    extent: tuple[float, float, float, float]
+    fixed: dict[int, float]
+    averaged: tuple[int, ...]
+    q_values: np.ndarray
+    values: np.ndarray
+    actions: np.ndarray
+    learned: np.ndarray
+
+
+def check_dims(dims: Any) -> tuple[int, int]:
+    """
+    :param dims: what was given as ``dims``
+    :return: two different dimensions
+    :raises ValueError: if it is anything else
+    """
+    try:
+        across, up = (check_integer("dims", dim, 0) for dim in dims)
+    except (TypeError, ValueError):
+        across = up = 0
+    if across == up:
+        raise ValueError(f"dims must be two different dimensions, counted from 0; got {shown(dims)}")
+    return across, up
+
+
+def check_fixed(fixed: Any) -> dict[int, float] | None:
+    """
+    :param fixed: what was given as ``fixed``
+    :return: dimensions, and where each is held
+    :raises ValueError: if it is anything else, or not finite
+    """
+    if fixed is None:
+        return None
+    if not isinstance(fixed, Mapping):
+        raise ValueError(f"fixed must give dimensions and where to hold them, {{2: 0.0}} say; got {shown(fixed)}")
+    return {check_integer("fixed: a dimension", dim, 0): check_number("fixed", fixed[dim]) for dim in fixed}
+
+
+def value_grid(
+    model: KNNAlgorithm,
+    dims: tuple[int, int] = (0, 1),
+    fixed: Mapping[int, float] | None = None,
+    resolution: int = 120,
+    average: bool = False,
+) -> ValueGrid:
+    """
+    Read values and greedy actions over the range of two dimensions.
+
+    :param model: a model of Box observations with at least two dimensions
+    :param dims: the two dimensions, horizontal and vertical
+    :param fixed: where to hold other dimensions, observation units
+    :param resolution: number of cells in each of the two dimensions
+    :param average: what is done with the dimensions that ``fixed`` does not name: they are held in the middle of their
+        range, or, if true, averaged over 32 places spread over it, of which those count where something was learned.
+        The action is then the one that is greedy at most of the places, and with ExA the mean
+    :return: the values. With VecNormalize, observation units are the normalised ones that the model sees
+    :raises ValueError: if the observations are not a Box of two or more dimensions, or ``dims``, ``fixed`` or
+        ``resolution`` do not fit
+    """
+    held, averaged = _check_view(model, dims, fixed, resolution, average)
+    low, high = _range(model)
+    n_dims, (across, up) = len(low), dims
+    middles = (np.arange(resolution) + 0.5) / resolution
+    observations = np.empty((resolution, resolution, n_dims))
+    for dim, value in held.items():
+        observations[..., dim] = value
+    observations[..., across] = low[across] + middles * (high[across] - low[across])
+    observations[..., up] = (low[up] + middles * (high[up] - low[up]))[:, None]
+
+    readings = []
+    for place in _places(low, high, averaged):
+        observations[..., averaged] = place
+        readings.append(_read(model, observations.reshape(-1, n_dims)))
+    grid = _join(readings, model.policy.table.n_actions)
+    return ValueGrid(
+        (int(across), int(up)),
+        (float(low[across]), float(high[across]), float(low[up]), float(high[up])),
+        held,
+        averaged,
+        *(array.reshape(resolution, resolution, *array.shape[1:]) for array in grid),
+    )
+
+
+def telling_dims(model: KNNAlgorithm, resolution: int = 60) -> tuple[int, int]:
+    """
+    Choose the two dimensions along which the value changes most, the others held in the middle of their range.
+
+    :param model: a model of Box observations with at least two dimensions
+    :param resolution: number of places looked at in each dimension
+    :return: two dimensions, the lower first
+    """
+    low, high = _range(model)
+    if len(low) == 2:
+        return 0, 1
+    spreads = []
+    for dim in range(len(low)):
+        line = np.tile((low + high) / 2, (resolution, 1))
+        line[:, dim] = np.linspace(low[dim], high[dim], resolution)
+        spreads.append(np.ptp(_read(model, line).values))
+    first, second = sorted(np.argsort(-np.array(spreads), kind="stable")[:2].tolist())
+    return first, second
+
+
+def _check_view(
+    model: KNNAlgorithm, dims: tuple[int, int], fixed: Mapping[int, float] | None, resolution: int, average: bool
+) -> tuple[dict[int, float], tuple[int, ...]]:
+    """Check a view; the values of the held dimensions, and the averaged dimensions."""
+    space = model.observation_space
+    if not isinstance(space, spaces.Box) or space.shape[0] < 2:
+        raise ValueError(f"a value function is drawn over two dimensions of a Box of observations; got {space}")
+    n_dims = space.shape[0]
+    if max(check_dims(dims)) >= n_dims:
+        raise ValueError(f"dims must be two different dimensions of 0 to {n_dims - 1}; got {dims!r}")
+    given = check_fixed(fixed) or {}
+    if not all(dim in range(n_dims) and dim not in dims for dim in given):
+        raise ValueError(
+            f"fixed must name dimensions of 0 to {n_dims - 1} other than those drawn, {dims}; got {given!r}"
+        )
+    check_integer("resolution", resolution, 1, FINEST)
+    low, high = _range(model)
+    others = [dim for dim in range(n_dims) if dim not in dims]
+    held = {dim: float(given.get(dim, (low[dim] + high[dim]) / 2)) for dim in others if dim in given or not average}
+    return held, tuple(dim for dim in others if dim not in held)
+
+
+class _Reading(NamedTuple):
+    """Values at a batch of observations; the fields are those of :class:`ValueGrid`."""
+
+    q_values: np.ndarray
+    values: np.ndarray
+    actions: np.ndarray
+    learned: np.ndarray
+
+
+def _read(model: KNNAlgorithm, observations: np.ndarray) -> _Reading:
+    batches = np.array_split(observations, -(-len(observations) // BATCH))
+    return _Reading(*map(np.concatenate, zip(*(_read_batch(model, batch) for batch in batches), strict=True)))
+
+
+def _read_batch(model: KNNAlgorithm, observations: np.ndarray) -> _Reading:
+    policy = model.policy
+    with th.no_grad():
+        rows, probabilities = policy.perceived_rows(observations)
+        q_values = mean_rows(rows, probabilities)
+        selector = policy.selector
+        values = selector.greedy_value(rows, probabilities)
+        selected = selector.greedy_indices(rows, probabilities)
+        actions = selector.actions_of(selected, probabilities).cpu().numpy()
+        learned = (rows != model.initial_value).flatten(1).any(dim=1)
+    return _Reading(q_values.cpu().numpy(), values.cpu().numpy(), actions, learned.cpu().numpy())
+
+
+def _places(low: np.ndarray, high: np.ndarray, averaged: tuple[int, ...]) -> np.ndarray:
+    """Evenly spread places in the averaged dimensions, shape (n_places, len(averaged))."""
+    if not averaged:
+        return np.empty((1, 0))
+    # The import takes two seconds, and most pictures do not need it.
+    from scipy.stats import qmc
+
+    dims = list(averaged)
+    spread: np.ndarray = qmc.Halton(len(dims), scramble=False).random(AVERAGED_PLACES + 1)[1:]
+    places: np.ndarray = low[dims] + spread * (high[dims] - low[dims])
+    return places
+
+
+def _join(readings: Sequence[_Reading], n_actions: int) -> _Reading:
+    """The mean over the places where something was learned; where nothing was, over all."""
+    if len(readings) == 1:
+        return readings[0]
+    q_values, values, actions, learned = (np.stack(part) for part in zip(*readings, strict=True))
+    anywhere = np.asarray(learned.any(axis=0))
+    counts = (learned | ~anywhere).astype(np.float64)
+    counts /= counts.sum(axis=0)
+    if actions.ndim == 2:
+        shares = np.stack([(counts * (actions == action)).sum(axis=0) for action in range(n_actions)])
+        joined = shares.argmax(axis=0)
+    else:
+        joined = (counts[..., None] * actions).sum(axis=0)
+    return _Reading((counts[..., None] * q_values).sum(axis=0), (counts * values).sum(axis=0), joined, anywhere)
+
+
+def _range(model: KNNAlgorithm) -> tuple[np.ndarray, np.ndarray]:
+    bounds = model.policy.perceiver.bounds
+    return bounds.low.cpu().numpy(), bounds.high.cpu().numpy()

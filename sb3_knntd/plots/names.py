@@ -1,0 +1,100 @@
+"""Names of the observation dimensions and actions of environments."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_knntd.base import KNNAlgorithm
+from sb3_knntd.common.checks import shown
+
+
+class Names(NamedTuple):
+    """
+    Names of the observation dimensions and actions of an environment.
+
+    :param observations: one name for each observation dimension, with its unit
+    :param actions: one name for each action, or for each dimension of the action
+    """
+
+    observations: tuple[str, ...]
+    actions: tuple[str, ...]
+
+
+#: The environments of gymnasium whose spaces KNNTD or ExA takes.
+NAMES = {
+    "MountainCar-v0": Names(("position", "velocity (position per step)"), ("push left", "no push", "push right")),
+    "CartPole-v1": Names(
+        ("cart position (m)", "cart velocity (m/s)", "pole angle (rad)", "pole angular velocity (rad/s)"),
+        ("push left", "push right"),
+    ),
+    "Acrobot-v1": Names(
+        ("cos θ₁", "sin θ₁", "cos θ₂", "sin θ₂", "angular velocity of θ₁ (rad/s)", "angular velocity of θ₂ (rad/s)"),
+        ("torque −1 N m", "no torque", "torque +1 N m"),
+    ),
+    "Pendulum-v1": Names(("cos θ", "sin θ", "angular velocity (rad/s)"), ("torque (N m)",)),
+    "MountainCarContinuous-v0": Names(("position", "velocity (position per step)"), ("force",)),
+}
+
+
+def check_names(names: Any) -> Names | None:
+    """
+    :param names: what was given as ``names``
+    :return: the same
+    :raises ValueError: if it is neither ``None`` nor two lists of words
+    """
+    if names is None:
+        return None
+    try:
+        checked = Names(*map(tuple, names))
+    except TypeError as error:
+        raise ValueError(f"names must be plots.Names(observations, actions); got {shown(names)}") from error
+    if not all(isinstance(name, str) for name in (*checked.observations, *checked.actions)):
+        raise ValueError(f"names must be plots.Names(observations, actions), of words; got {shown(names)}")
+    return checked
+
+
+def names_for(model: KNNAlgorithm, names: Names | None = None) -> Names:
+    """
+    :param model: a model of Box observations
+    :param names: what the user wants them to be called
+    :return: these, or else those in ``NAMES`` of the model's environment, or else numbers
+    :raises ValueError: if ``names`` does not fit the model's spaces
+    """
+    names = check_names(names)
+    if names is not None and not _fit(names, model):
+        raise ValueError(
+            f"names must hold one for each observation dimension and one for each action (each action dimension with "
+            f"ExA); got {names!r}"
+        )
+    return names or _names_of(model) or _numbered(model)
+
+
+def _names_of(model: KNNAlgorithm) -> Names | None:
+    env = model.get_env()
+    spec = None if env is None else env.get_attr("spec", 0)[0]
+    names = None if spec is None else NAMES.get(spec.id)
+    # A wrapper may have changed the spaces.
+    return names if names is not None and _fit(names, model) else None
+
+
+def _fit(names: Names, model: KNNAlgorithm) -> bool:
+    return model.observation_space.shape == (len(names.observations),) and len(names.actions) == _count_actions(model)
+
+
+def _count_actions(model: KNNAlgorithm) -> int:
+    """Number of actions, or of their dimensions."""
+    space = model.action_space
+    return int(space.n) if isinstance(space, spaces.Discrete) else int(np.prod(space.shape or ()))
+
+
+def _numbered(model: KNNAlgorithm) -> Names:
+    assert isinstance(model.observation_space, spaces.Box)
+    space, n_actions = model.action_space, _count_actions(model)
+    if isinstance(space, spaces.Discrete):
+        actions = tuple(f"action {number}" for number in range(space.start, space.start + n_actions))
+    else:
+        actions = tuple(f"action[{dim}]" for dim in range(n_actions))
+    return Names(tuple(f"observation[{dim}]" for dim in range(model.observation_space.shape[0])), actions)
