@@ -337,6 +337,10 @@ class KNNPolicy(BasePolicy):
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
         if not isinstance(state_dict, Mapping):
             raise ValueError(f"the state of a policy must be a dict of tensors; got {str(state_dict)[:100]}")
+        places = state_dict.get("perceiver.points.places")
+        if isinstance(places, th.Tensor) and isinstance(self.table, DenseTable):
+            # Points may have been added to those that the policy was made with.
+            self.table.resize(len(places))
         answer = super().load_state_dict(state_dict, strict, assign)
         # Saved bounds may differ from those of the space, where they were measured.
         self.perceiver.fit()

@@ -153,7 +153,7 @@ def test_interrupts_at_random_moments(table: str, n_interrupts: int) -> None:
         return True
 
     def interrupt(*_: Any) -> None:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
 
     model.learn(100, callback=callback)
     random = np.random.default_rng(0)
@@ -241,7 +241,7 @@ FAULTS: dict[str, tuple[Callable[[list[Any]], None], str]] = {
     "fewer observations": (replace(0, lambda: np.zeros((1, 2), NUMBERS)), r"observations.*\(1, 2\).*\(2, 2\)"),
     "wider observations": (replace(0, lambda: np.zeros((2, 5), NUMBERS)), r"observations.*\(2, 5\).*\(2, 2\)"),
     "flat observations": (replace(0, lambda: np.zeros(2, NUMBERS)), r"observations.*\(2,\).*\(2, 2\)"),
-    "words": (replace(0, lambda: np.full((2, 2), "a")), r"observations.*numbers.*<U1"),
+    "words": (replace(0, lambda: np.full((2, 2), "a")), r"observations.*<U1.*numbers"),
     "no array": (replace(0, lambda: [[0.0, 0.0], [0.0, 0.0]]), r"observations.*list"),
     "fewer rewards": (replace(1, lambda: np.zeros(1, NUMBERS)), r"rewards.*\(1,\).*\(2,\)"),
     "columns of rewards": (replace(1, lambda: np.zeros((2, 1), NUMBERS)), r"rewards.*\(2, 1\).*\(2,\)"),

@@ -41,17 +41,22 @@ def watkins(model: Model, transitions: Transitions, alpha: float, trace_decay: f
     columns = model.policy.columns_of(transitions.actions)[:, 0]
     each = isinstance(model, ExA)
 
+    def mean(shares: np.ndarray, values: np.ndarray) -> float:
+        # A dot product would round strided values in another order.
+        return float((shares * values).sum())
+
     def perceive(observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         perception = model.policy.perceive(observation)
         return perception.indices[0].numpy(), perception.probabilities[0].numpy()
 
     def best(indices: np.ndarray, shares: np.ndarray) -> float:
         rows = table[indices]
-        return float(shares @ rows.max(axis=1)) if each else float((shares @ rows).max())
+        return mean(shares, rows.max(axis=1)) if each else float((shares @ rows).max())
 
     for t in range(len(columns)):
         indices, shares = perceive(transitions.observations[t])
-        given = float(shares @ table[indices, columns[t]])
+        rows = table[indices]
+        given = mean(shares, rows[:, columns[t]]) if each else float((shares @ rows)[columns[t]])
         if goes_on and given < best(indices, shares):
             traces[:] = 0.0
         value = best(indices, shares) if each else given

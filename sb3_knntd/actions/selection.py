@@ -176,11 +176,10 @@ class ActionSelector(ABC):
         :param columns: a column for each action factor, shape (batch, n_factors), int64
         :return: shape (batch,)
         """
-        values = [
-            (probabilities * rows.gather(2, columns[:, None, factor, None].expand(*rows.shape[:2], 1))[..., 0]).sum(1)
-            for factor in range(columns.shape[1])
+        chosen = [
+            rows.gather(2, columns[:, None, [factor]].expand(*rows.shape[:2], 1)) for factor in range(self.n_factors)
         ]
-        return th.stack(values).mean(dim=0)
+        return (probabilities * th.cat(chosen, dim=2).mean(dim=2)).sum(dim=1)
 
     def random_columns(self, uniforms: np.ndarray) -> np.ndarray:
         """
@@ -272,6 +271,10 @@ class MeanValueSelector(ActionSelector):
 
     def greedy_value(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
         return mean_rows(rows, probabilities).amax(dim=1)
+
+    def given_value(self, rows: th.Tensor, probabilities: th.Tensor, columns: th.Tensor) -> th.Tensor:
+        # Rounded as the greedy value is, with which it is compared.
+        return mean_rows(rows, probabilities).gather(1, columns)[:, 0]
 
 
 class MeanActionSelector(ActionSelector):

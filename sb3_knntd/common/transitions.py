@@ -80,27 +80,27 @@ class StepCheck:
     @staticmethod
     def _refuse(call: str, what: str, array: Any, shape: tuple[int, ...], kinds: str = NUMBERS) -> None:
         """Raise an error that says how an array differs from what is expected, if it does."""
-        wanted = "truth values" if kinds == TRUTHS else "numbers"
         if not isinstance(array, np.ndarray):
-            got = f"got {type(array).__name__}"
+            got = f"a {type(array).__name__}"
         elif array.shape != shape:
-            got = f"got shape {array.shape}{_first_odd_row(array, shape)}"
+            got = f"shape {array.shape}{_first_odd_row(array, shape)}"
         elif array.dtype.kind not in kinds:
-            got = f"got type {array.dtype}"
+            got = f"type {array.dtype}"
         else:
             return
+        wanted = "truth values" if kinds == TRUTHS else "numbers"
         raise ValueError(
-            f"the VecEnv's {call} must return {what} as an array of {wanted} of shape {shape}, a row for each of its "
-            f"{shape[0]} environments; {got}"
+            f"the VecEnv's {call} returned {what} of {got}; expected an array of {wanted} of shape {shape}, a row for "
+            f"each of its {shape[0]} environments"
         )
 
 
 def _first_odd_row(array: np.ndarray, shape: tuple[int, ...]) -> str:
     """Which environment has no row, or is the first that has one too many."""
     if array.ndim and array.shape[0] < shape[0]:
-        return f", and so nothing for environment {array.shape[0]}"
+        return f", without one for environment {array.shape[0]}"
     if array.ndim and array.shape[1:] != shape[1:]:
-        return ", from environment 0 on"
+        return ", wrong from environment 0 on"
     return ""
 
 

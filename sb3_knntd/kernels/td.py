@@ -29,7 +29,9 @@ from sb3_knntd.kernels.traces import (
     flush,
     largest_size,
     read_active_row,
+    read_stored_row,
     set_trace,
+    stored_value,
 )
 
 #: Which state's arrays: that the environment left, that it is in, or the last one before a truncation.
@@ -116,21 +118,25 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
     chosen = state.action_indices[CURRENT]
     places, corrections, row, factors = state.places, state.corrections, state.row, state.factors
     entries, slots, clock = state.active_entries, state.active_slots, state.clock
+    values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
     n_envs, k, n_factors = chosen.shape
     size, value_sum, change = 0.0, 0.0, 0.0
     for env in range(n_envs):
         value, squares = 0.0, 0.0
         for i in range(k):
-            point = indices[env, i]
-            place = find(point, slots)
-            if place < 0:
-                place = activate(point, state, state)
+            place, probability = find(indices[env, i], slots), probabilities[env, i]
             places[env, i] = place
-            probability = probabilities[env, i]
             if state.combination == Combination.OF_VALUES:
-                value += probability * active_value(entries, place, chosen[env, i, 0], clock)
+                column = chosen[env, i, 0]
+                if place >= 0:
+                    value += probability * active_value(entries, place, column, clock)
+                else:
+                    value += probability * stored_value(indices[env, i], column, values, row_slots, initial_value)
             else:
-                read_active_row(entries, place, clock, row)
+                if place >= 0:
+                    read_active_row(entries, place, clock, row)
+                else:
+                    read_stored_row(indices[env, i], values, row_slots, initial_value, row)
                 for factor in range(n_factors):
                     value += probability * largest(row, factors[factor], factors[factor + 1]) / n_factors
             squares += probability * probability
@@ -147,6 +153,11 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
     for env in range(n_envs):
         for i in range(k):
             place, trace = places[env, i], probabilities[env, i] / clock[0]
+            if place < 0:
+                # Another environment may have made it active meanwhile.
+                place = find(indices[env, i], slots)
+                if place < 0:
+                    place = activate(indices[env, i], state, state)
             for factor in range(n_factors):
                 entry = chosen[env, i, factor]
                 if state.accumulating:

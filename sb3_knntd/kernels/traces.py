@@ -135,6 +135,25 @@ def read_active_row(entries, place, clock, row):
 
 
 @inlined
+def stored_value(point, action, values, row_slots, initial_value):
+    """The value that the table has for an entry."""
+    row = row_of(point, row_slots)
+    return values[row, action] if row >= 0 else initial_value
+
+
+@inlined
+def read_stored_row(point, values, row_slots, initial_value, row):
+    """Write the values that the table has for a point into ``row``, shape (n_actions,)."""
+    place = row_of(point, row_slots)
+    if place >= 0:
+        for action in range(len(row)):
+            row[action] = values[place, action]
+    else:
+        for action in range(len(row)):
+            row[action] = initial_value
+
+
+@inlined
 def read_row(point, values, row_slots, initial_value, entries, slots, clock, row):
     """
     Write the values of a point into ``row``, shape (n_actions,).
@@ -146,13 +165,7 @@ def read_row(point, values, row_slots, initial_value, entries, slots, clock, row
     if place >= 0:
         read_active_row(entries, place, clock, row)
     else:
-        place = row_of(point, row_slots)
-        if place >= 0:
-            for action in range(len(row)):
-                row[action] = values[place, action]
-        else:
-            for action in range(len(row)):
-                row[action] = initial_value
+        read_stored_row(point, values, row_slots, initial_value, row)
 
 
 @jit

@@ -10,6 +10,7 @@ import torch as th
 
 from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.checks import check_finite
+from sb3_knntd.common.interrupts import interrupts_held
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels import td
@@ -96,9 +97,10 @@ class Workplace:
             random,
             self.work,
         )
-        # The state does not keep its arrays.
-        self._lent = groups
-        self.state = make_state(*groups)
+        # numba cannot be interrupted while it hands a state over.
+        with interrupts_held():
+            # The state does not keep its arrays.
+            self.state, self._lent = make_state(*groups), groups
 
     def follow(self) -> bool:
         """

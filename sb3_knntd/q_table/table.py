@@ -265,6 +265,18 @@ class DenseTable(QTable):
             self.values.copy_(values)
             self.visited.copy_(visited)
 
+    def resize(self, n_points: int) -> None:
+        """
+        Have rows for so many points. Where that is another number, all begin anew with the initial value.
+
+        :param n_points: number of rows
+        """
+        if n_points != len(self.values):
+            with self.lock:
+                self.forget_traces()
+                self.values = self.values.new_full((n_points, self.n_actions), self.initial_value)
+                self.visited = self._no_visits(n_points).to(self.values.device)
+
     def _visits(self) -> th.Tensor:
         """Which rows have been learned at, shape (n_points,), bool."""
         bits = th.arange(8, device=self.visited.device, dtype=th.uint8)
