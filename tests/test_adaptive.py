@@ -232,7 +232,7 @@ def test_traces_do_not_outlive_the_points_they_were_set_at() -> None:
     counts = []
 
     def look(local: dict[str, Any], _: dict[str, Any]) -> bool:
-        counts.append((model._last_actions is None, model.learner.live.count))  # type: ignore[attr-defined]
+        counts.append((not model.learner.in_episodes, model.learner.n_traced))
         return True
 
     model.learn(1800, callback=look)
