@@ -14,7 +14,7 @@ SelfStepwiseAlgorithm = TypeVar("SelfStepwiseAlgorithm", bound="StepwiseAlgorith
 
 class StepwiseAlgorithm(BaseAlgorithm):
     """
-    An algorithm whose policy is all that it learns.
+    Base class of algorithms that learn nothing but their policy.
 
     The parameters are SB3's.
     """
@@ -26,7 +26,7 @@ class StepwiseAlgorithm(BaseAlgorithm):
     def _learn_from(
         self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
-        """Learn from the step that the last actions led to."""
+        """Learn from the step of the last actions."""
 
     def learn(
         self: SelfStepwiseAlgorithm,
@@ -38,13 +38,13 @@ class StepwiseAlgorithm(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> SelfStepwiseAlgorithm:
         """
-        Act, and learn, for so many steps.
+        Train the model.
 
-        :param total_timesteps: environment steps, over all environments together
-        :param callback: called at every step, after it has been learned from
-        :param log_interval: not used, nothing is logged; part of SB3's signature
+        :param total_timesteps: number of environment steps, of all environments together
+        :param callback: called at every step, after the update
+        :param log_interval: not used, because nothing is logged; part of SB3's signature
         :param tb_log_name: name of the run in TensorBoard
-        :param reset_num_timesteps: whether to count steps from 0
+        :param reset_num_timesteps: whether to reset the step counter
         :param progress_bar: whether to show a progress bar (tqdm and rich)
         :return: the model
         """
