@@ -1,1 +1,1 @@
-"""What the project measures: `python -m benchmarks.speed`, `python -m benchmarks.learning`."""
+"""Benchmarks: `python -m benchmarks.speed`, `python -m benchmarks.learning` and others."""

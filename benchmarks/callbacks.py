@@ -1,5 +1,5 @@
 """
-What callbacks cost at their default frequency, as a share of the time that learning takes without any.
+The overhead of callbacks at their default frequency, as a share of the time of training without callbacks.
 
     python -m benchmarks.callbacks [--seconds 120] [--repeats 7] [--json FILE]
 """
@@ -32,13 +32,13 @@ from sb3_knntd import KNNTD
 from sb3_knntd.common.callback_dispatcher import CallbackDispatcher
 
 ENV_ID = "MountainCar-v0"
-TOGETHER = "all five together"
-#: Steps that a time of a step is taken over.
+TOGETHER = "all five"
+#: Number of steps over which the time of a step is measured.
 STEPS = 20_000
 
 
-class Nothing(BaseCallback):
-    """SB3's least callback."""
+class MinimalCallback(BaseCallback):
+    """A callback that does nothing."""
 
     def _on_step(self) -> bool:
         return True
@@ -48,11 +48,11 @@ class Row(NamedTuple):
     """
     One line of the table.
 
-    :param name: of the callback
-    :param call: microseconds that it takes to tell it of a step at which it has nothing to do
+    :param name: name of the callback
+    :param call: microseconds of a call at a step at which it has nothing to do
     :param call_share: the same as a share of a step without callbacks
-    :param act: seconds of one act, the mean; ``None`` for callbacks without any
-    :param act_share: share of the time spent on acting, but for the one at the end of training
+    :param act: mean seconds of its occasional work; ``None`` if there was none
+    :param act_share: share of the time spent on that work, without the one at the end of training
     """
 
     name: str
@@ -64,8 +64,8 @@ class Row(NamedTuple):
 
 def make_callbacks(folder: Path) -> dict[str, BaseCallback]:
     """
-    :param folder: where files go
-    :return: each of the package's callbacks, with its defaults
+    :param folder: output folder
+    :return: the package's callbacks with their default arguments, by name
     """
     return {
         "ValueMapCallback": ValueMapCallback(),
@@ -78,15 +78,15 @@ def make_callbacks(folder: Path) -> dict[str, BaseCallback]:
 
 def make_model(folder: Path) -> KNNTD:
     """
-    :param folder: where TensorBoard's log goes
+    :param folder: folder of TensorBoard's log
     """
     return KNNTD(ENV_ID, seed=0, tensorboard_log=str(folder))
 
 
 def step_seconds(repeats: int) -> float:
     """
-    :param repeats: the best of so many, since what else the machine does only adds
-    :return: seconds of the processor that a step without callbacks takes
+    :param repeats: number of measurements; the minimum is returned, because other load only adds time
+    :return: CPU seconds of a step without callbacks
     """
     model = KNNTD(ENV_ID, seed=0)
     times = []
@@ -99,10 +99,10 @@ def step_seconds(repeats: int) -> float:
 
 def call_seconds(callback: BaseCallback, folder: Path, repeats: int) -> float:
     """
-    :param callback: any
-    :param folder: where TensorBoard's log goes
-    :param repeats: the best of so many
-    :return: seconds of the processor that it takes to tell it of a step, when it has nothing to do
+    :param callback: a callback
+    :param folder: folder of TensorBoard's log
+    :param repeats: number of measurements; the minimum is returned
+    :return: CPU seconds of a call when the callback has nothing to do
     """
     seen: dict[str, Any] = {}
 
@@ -111,7 +111,7 @@ def call_seconds(callback: BaseCallback, folder: Path, repeats: int) -> float:
         return True
 
     model = make_model(folder)
-    # Ends within an episode.
+    # Stop in the middle of an episode.
     model.learn(150, callback=see)
     callback.init_callback(model)
     callback.on_training_start(seen, {})
@@ -123,7 +123,7 @@ def call_seconds(callback: BaseCallback, folder: Path, repeats: int) -> float:
     for _ in range(repeats):
         start = time.process_time()
         for _ in range(STEPS):
-            # What the algorithm does about its callbacks in a step.
+            # The algorithm's calls in one step.
             for listener in dispatcher.every_step:
                 listener.on_rollout_start()
             if dispatcher.record_step(observations, False):
@@ -136,9 +136,9 @@ def call_seconds(callback: BaseCallback, folder: Path, repeats: int) -> float:
 
 class Watch:
     """
-    Times what a callback does now and then.
+    Measures the occasional work of a callback.
 
-    :param act: its ``_act``
+    :param act: the callback's ``_act``
     """
 
     def __init__(self, act: Callable[[], None]) -> None:
@@ -153,9 +153,9 @@ class Watch:
 
 class Deadline(BaseCallback):
     """
-    Ends training, and notes when.
+    Stops training after a given time.
 
-    :param seconds: how long it is to last
+    :param seconds: duration of the training
     """
 
     def __init__(self, seconds: float) -> None:
@@ -172,11 +172,11 @@ class Deadline(BaseCallback):
 
 def acts(folder: Path, seconds: float) -> tuple[dict[str, list[float]], float]:
     """
-    Learn with all callbacks together.
+    Train with all callbacks together.
 
-    :param folder: where files go
-    :param seconds: for how long
-    :return: seconds of each callback's acts, but for the last, and how long it took in all
+    :param folder: output folder
+    :param seconds: duration of the training
+    :return: seconds of each callback's work, without the last one, and the total time
     """
     callbacks, deadline, watches = make_callbacks(folder), Deadline(seconds), {}
     for name, callback in callbacks.items():
@@ -188,8 +188,8 @@ def acts(folder: Path, seconds: float) -> tuple[dict[str, list[float]], float]:
 
 def measure(seconds: float, repeats: int) -> tuple[float, list[Row]]:
     """
-    :param seconds: how long to learn with all callbacks
-    :param repeats: how often short times are taken
+    :param seconds: duration of the training with all callbacks
+    :param repeats: number of repeated short measurements
     :return: seconds of a step without callbacks, and the lines of the table
     """
     with tempfile.TemporaryDirectory() as name:
@@ -200,7 +200,7 @@ def measure(seconds: float, repeats: int) -> tuple[float, list[Row]]:
         all_together = CallbackList([*make_callbacks(folder).values()])
         rows = []
         for each, callback in {
-            "SB3's least callback": Nothing(),
+            "a minimal SB3 callback": MinimalCallback(),
             **make_callbacks(folder),
             TOGETHER: all_together,
         }.items():
@@ -213,13 +213,13 @@ def measure(seconds: float, repeats: int) -> tuple[float, list[Row]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=120.0, help="how long to learn with all callbacks")
-    parser.add_argument("--repeats", type=int, default=7, help="how often short times are taken")
+    parser.add_argument("--seconds", type=float, default=120.0, help="duration of the training with all callbacks")
+    parser.add_argument("--repeats", type=int, default=7, help="number of repeated short measurements")
     parser.add_argument("--json", metavar="FILE", help="also store the table")
     arguments = parser.parse_args()
     th.set_num_threads(1)
     step, rows = measure(arguments.seconds, arguments.repeats)
-    print("| callback | call, µs | calls, % of a step | act, ms | acts, % of the time | together, % |")
+    print("| callback | call, µs | calls, % of a step | act, ms | acts, % of the time | total, % |")
     print("|---|---|---|---|---|---|")
     for row in rows:
         act = "" if row.act is None else f"{1e3 * row.act:.0f}"

@@ -4,9 +4,9 @@ whose offsets, noise and dynamics the learner does not know.
 
     python -m benchmarks.competition [--problems 30] [--first-problem 0] [--workers N] [--json FILE]
 
-Each problem is learned for 100 episodes of at most 1000 steps, all of them counted, once for each way of seeing it:
-through the δs filter and adaptive bounds, with one of them, and with neither. A table shows the steps of an episode,
-the median over problems, and the share of problems whose last ten episodes take 150 steps or fewer in the mean.
+Training on each problem lasts 100 episodes of at most 1000 steps, once with the δs filter and adaptive bounds, with
+each of them alone, and with neither. The table shows the steps per episode, medians over the problems, and the share of
+problems with a mean of at most 150 steps over the last ten episodes.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from sb3_knntd import KNNTD, VecDeltaFilter
 
 ENV_ID = "sb3_knntd/GeneralizedMountainCar-v0"
 EPISODES, MOST_STEPS = 100, 1000
-#: What an episode may take in the end, and over how many that is asked.
+#: Target for the mean number of steps, and number of final episodes that it is taken over.
 WANTED_STEPS, LAST_EPISODES = 150, 10
 
 
-class Sight(NamedTuple):
+class Variant(NamedTuple):
     """
-    How the problems are seen.
+    How the observations are processed.
 
-    :param what: its name
-    :param filtered: whether through the δs filter
-    :param bounds: of learner and filter
+    :param what: name in the table
+    :param filtered: whether to use the δs filter
+    :param bounds: bounds of learner and filter
     """
 
     what: str
@@ -48,19 +48,19 @@ class Sight(NamedTuple):
     bounds: str | None
 
 
-SIGHTS = (
-    Sight("filter, adaptive bounds", True, "adaptive"),
-    Sight("adaptive bounds", False, "adaptive"),
-    Sight("filter", True, None),
-    Sight("neither", False, None),
+VARIANTS = (
+    Variant("filter, adaptive bounds", True, "adaptive"),
+    Variant("adaptive bounds", False, "adaptive"),
+    Variant("filter", True, None),
+    Variant("neither", False, None),
 )
 
 
 class CountEpisodes(BaseCallback):
     """
-    Notes how long episodes are, and ends the training after so many.
+    Records the lengths of episodes, and stops training after a number of them.
 
-    :param n_episodes: how many
+    :param n_episodes: number of episodes
     """
 
     def __init__(self, n_episodes: int) -> None:
@@ -75,22 +75,22 @@ class CountEpisodes(BaseCallback):
 
 def settings() -> dict[str, Any]:
     """
-    :return: arguments of the learner in ``zoo_configs/knntd.yml``
+    :return: the algorithm's arguments in ``zoo_configs/knntd.yml``
     """
     return {name: value for name, value in tuned_settings("knntd", ENV_ID).items() if name != "vec_env_wrapper"}
 
 
-def learn(sight: Sight, problem: int) -> list[int]:
+def learn(variant: Variant, problem: int) -> list[int]:
     """
-    :param sight: how it is seen
+    :param variant: how the observations are processed
     :param problem: number of the problem
     :return: steps of each episode
     """
     th.set_num_threads(1)
     venv: VecEnv = DummyVecEnv([lambda: Monitor(gym.make(ENV_ID, problem=problem, max_episode_steps=MOST_STEPS))])
-    if sight.filtered:
-        venv = VecDeltaFilter(venv, bounds=sight.bounds)
-    model = KNNTD(venv, **{**settings(), "bounds": sight.bounds}, seed=problem)
+    if variant.filtered:
+        venv = VecDeltaFilter(venv, bounds=variant.bounds)
+    model = KNNTD(venv, **{**settings(), "bounds": variant.bounds}, seed=problem)
     count = CountEpisodes(EPISODES)
     model.learn(EPISODES * MOST_STEPS, callback=count)
     return count.lengths
@@ -99,23 +99,23 @@ def learn(sight: Sight, problem: int) -> list[int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problems", type=int, default=30, help="number of problems")
-    parser.add_argument("--first-problem", type=int, default=0, help="the configuration was tuned on 200 to 207")
-    parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
+    parser.add_argument("--first-problem", type=int, default=0, help="problems 200 to 207 were used for tuning")
+    parser.add_argument("--workers", type=int, help="number of processes, by default one per core")
     parser.add_argument("--json", metavar="FILE", help="also store the steps of all episodes")
     arguments = parser.parse_args()
     problems = range(arguments.first_problem, arguments.first_problem + arguments.problems)
     blocks = [(0, 10), (10, 20), (20, 50), (50, 90), (90, 100)]
     names = " | ".join(f"episodes {first + 1} to {end}" for first, end in blocks)
-    print(f"| seen through | {names} | in the end at most {WANTED_STEPS} |")
+    print(f"| observations | {names} | at most {WANTED_STEPS} at the end |")
     print("|" + "---|" * (len(blocks) + 2))
     stored = {}
     with ProcessPoolExecutor(arguments.workers) as pool:
-        for sight in SIGHTS:
-            lengths = np.array(list(pool.map(learn, [sight] * len(problems), problems)))
+        for variant in VARIANTS:
+            lengths = np.array(list(pool.map(learn, [variant] * len(problems), problems)))
             medians = " | ".join(f"{np.median(lengths[:, first:end].mean(axis=1)):.0f}" for first, end in blocks)
             share = (lengths[:, -LAST_EPISODES:].mean(axis=1) <= WANTED_STEPS).mean()
-            print(f"| {sight.what} | {medians} | {share:.0%} of problems |", flush=True)
-            stored[sight.what] = lengths.tolist()
+            print(f"| {variant.what} | {medians} | {share:.0%} of problems |", flush=True)
+            stored[variant.what] = lengths.tolist()
     machine = ", ".join(f"{key} {value}" for key, value in describe().items())
     print(f"\nProblems {problems[0]} to {problems[-1]}. {machine}")
     if arguments.json:

@@ -1,4 +1,4 @@
-"""The torch step on an accelerator: 4096 environments against 10^6 points, and the bandwidth that it reaches."""
+"""The torch step on a GPU: memory bandwidth with 4096 environments and 10^6 points."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ N_ENVS, POINTS, K = 4096, 1000, 16
 
 def bandwidth(work: Callable[[], Any], n_bytes: float, repeats: int) -> list[float]:
     """
-    :param work: what is timed, on the device
-    :param n_bytes: bytes it has to move at least
-    :param repeats: how often
-    :return: bytes a second of each run
+    :param work: the function to measure, which runs on the device
+    :param n_bytes: lower bound of the bytes that it moves
+    :param repeats: number of measurements
+    :return: bytes per second of each measurement
     """
     work()
     rates = []
@@ -40,11 +40,11 @@ def bandwidth(work: Callable[[], Any], n_bytes: float, repeats: int) -> list[flo
 
 def against_copy(repeats: int) -> list[Row]:
     """
-    Bytes that perception (every distance written once and read once by the selection) and the update (rows read and
-    written) have to move, over their time, as a share of the bandwidth of a device-to-device copy.
+    Measure the bandwidth of perception (every distance is written once and read once by the selection) and of a whole
+    step (which also reads and writes rows of the table), as a share of the bandwidth of a device-to-device copy.
 
-    :param repeats: how often each is run
-    :return: a row for each
+    :param repeats: number of measurements
+    :return: one row for each
     """
     device = th.device("cuda")
     box = spaces.Box(-1.0, 1.0, (2,), np.float32)

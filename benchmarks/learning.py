@@ -1,11 +1,11 @@
 """
-What is learned, as distributions over seeds: with no argument but the environment, with tuned settings, and with
-many environments in step.
+Returns after training, as distributions over seeds: with default settings, with tuned settings, and with many parallel
+environments.
 
     python -m benchmarks.learning [--seeds 10] [--first-seed 100] [--only TABLE ...] [--json FILE]
 
-Each seed trains a model and then plays 100 greedy episodes in an environment of its own; the figure of a seed is their
-mean return, and a line shows the median over seeds with the 10 % and 90 % quantiles.
+Each seed trains a model and evaluates it over 100 greedy episodes in a separate environment. A line shows the median of
+the mean returns over the seeds, with the 10 % and 90 % quantiles.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class Case(NamedTuple):
     """
     One line of a table.
 
-    :param what: its name
-    :param env_id: environment
-    :param steps: environment steps of the training, over all environments together
-    :param target: what the median must reach; ``None`` if there is nothing to reach
-    :param n_envs: environments in step
-    :param tuned: whether the settings are those of ``zoo_configs/``
+    :param what: name of the setting
+    :param env_id: id of the environment
+    :param steps: number of training steps, of all environments together
+    :param target: required median, ``None`` for no requirement
+    :param n_envs: number of parallel environments
+    :param tuned: whether to use the settings of ``zoo_configs/``
     :param algorithm: name of an algorithm of this package
     """
 
@@ -74,8 +74,8 @@ TABLES = {
 def tuned_settings(algorithm: str, env_id: str) -> dict[str, Any]:
     """
     :param algorithm: name of an algorithm of this package
-    :param env_id: environment
-    :return: its arguments in ``zoo_configs/``, schedules made into functions
+    :param env_id: id of the environment
+    :return: the algorithm's arguments in ``zoo_configs/``, with schedules as functions
     """
     path = ALGORITHMS[algorithm].config_path
     assert path is not None
@@ -85,7 +85,7 @@ def tuned_settings(algorithm: str, env_id: str) -> dict[str, Any]:
 
 def play(case: Case, seed: int) -> float:
     """
-    :param case: what to train
+    :param case: what to train and evaluate
     :param seed: seed of the model and its environments
     :return: mean return of the greedy policy
     """
@@ -103,9 +103,9 @@ def play(case: Case, seed: int) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10, help="number of seeds")
-    parser.add_argument("--first-seed", type=int, default=100, help="the settings were tuned on others")
+    parser.add_argument("--first-seed", type=int, default=100, help="seeds 100 to 109 were not used for tuning")
     parser.add_argument("--only", nargs="+", choices=TABLES, metavar="TABLE", help=", ".join(TABLES))
-    parser.add_argument("--json", metavar="FILE", help="also store every seed's figure")
+    parser.add_argument("--json", metavar="FILE", help="also store the result of every seed")
     arguments = parser.parse_args()
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     stored = []

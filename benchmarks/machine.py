@@ -1,4 +1,4 @@
-"""What a figure was measured on."""
+"""Description of the machine and software of a measurement."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ PACKAGES = ("sb3-knntd", "stable-baselines3", "gymnasium", "torch", "numpy", "nu
 
 def describe() -> dict[str, str]:
     """
-    :return: processor, cores, system and the versions that matter
+    :return: processor, cores, system and versions of the relevant packages
     """
     return machine() | versions(PACKAGES)

@@ -1,21 +1,21 @@
 """
-What the δs filter takes out of noisy observations, what it costs, and what it does for learning.
+Noise reduction by the δs filter, its overhead, and its effect on learning.
 
     python -m benchmarks.noise [--seeds 10] [--first-seed 100] [--only TABLE ...] [--json FILE]
 
-Observations have Gaussian noise of 3 % of each dimension's range: that of the observation space where it is finite, and
--3 to 3 for CartPole's velocities.
+Observations have Gaussian noise with a standard deviation of 3 % of each dimension's range: that of the observation
+space where it is finite, and -3 to 3 for CartPole's velocities.
 
-``rmse``      error of the estimates over that of the observations, by dimension, while a fixed controller acts on the
-              true state: over the last 10,000 of 60,000 steps. Beside it Algorithm 5 as it stands, and an extended
-              Kalman filter that knows the dynamics and the noise
+``rmse``      error of the estimates divided by that of the observations, by dimension, while a fixed controller acts on
+              the true state: over the last 10,000 of 60,000 steps; for the filter, the unmodified Algorithm 5, and an
+              extended Kalman filter that knows the dynamics and the noise
 ``soon``      the same after fewer steps
-``harmless``  returns without noise, with and without the filter: of the same controllers acting on what is returned,
-              and of what is learned from it
-``learning``  returns under noise of what KNNTD learned under noise, also as shares of the way from random actions to
-              what it learns without noise
+``harmless``  returns without noise, with and without the filter: of the same controllers acting on the estimates, and
+              of models trained on them
+``learning``  returns of KNNTD with noise in training and evaluation, also as shares between random actions (0 %) and
+              training without noise (100 %)
 ``dqn``       the same for DQN, which takes long
-``time``      a step with and without the filter
+``time``      time of a step with and without the filter
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ from benchmarks.machine import describe
 from sb3_knntd import DeltaFilter, VecDeltaFilter
 from sb3_knntd.registry import ALGORITHMS, Role, with_role
 
-#: Standard deviation of the noise over a dimension's range.
+#: Standard deviation of the noise divided by a dimension's range.
 NOISE = 0.03
-#: Steps that the filter learns for, and over which its error is then taken.
+#: Number of learning steps of the filter, and of steps over which its error is measured afterwards.
 LEARNING, EVALUATION = 50_000, 10_000
-#: The same, of the table ``soon``.
+#: Numbers of learning steps of the table ``soon``.
 SOON = (0, 5_000, 10_000, 20_000)
-#: Settings of Algorithm 5 as it stands.
+#: Settings of the unmodified Algorithm 5.
 ALGORITHM_5 = {"learning_rate": 0.5, "gain": None, "warmup": 0.0}
 EPISODES = 100
 
 
 class NoisyObservation(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """
-    Adds Gaussian noise to observations, and keeps the true ones.
+    Adds Gaussian noise to observations, and stores the true ones.
 
     :param env: environment
     :param scale: standard deviations, shape (obs_dim,), observation units
@@ -66,7 +66,7 @@ class NoisyObservation(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         super().__init__(env)
         self.scale = scale
         self._random = np.random.default_rng(seed)
-        #: the observation without noise
+        #: The observation without noise.
         self.true = np.zeros(len(scale))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
@@ -84,12 +84,12 @@ class NoisyObservation(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
 
 
 def drive(observation: np.ndarray) -> int:
-    """Mountain-Car: push the way it moves."""
+    """Mountain-Car: push in the direction of motion."""
     return 2 if observation[1] >= 0 else 0
 
 
 def balance(observation: np.ndarray) -> int:
-    """CartPole: push the way it falls, the cart kept near the middle."""
+    """CartPole: push in the direction in which the pole falls, and keep the cart near the centre."""
     return int(np.dot([0.3, 0.6, 8.0, 1.6], observation) > 0)
 
 
@@ -107,27 +107,27 @@ def swing_up(observation: np.ndarray) -> np.ndarray:
 
 
 def angle_of(observation: np.ndarray) -> np.ndarray:
-    """Pendulum: the state that gives an observation."""
+    """Pendulum: the state of an observation."""
     return np.array([np.arctan2(observation[1], observation[0]), observation[2]])
 
 
 def cosine_of(state: np.ndarray) -> np.ndarray:
-    """Pendulum: the observation that a state gives."""
+    """Pendulum: the observation of a state."""
     return np.array([np.cos(state[0]), np.sin(state[0]), state[1]])
 
 
 class Case(NamedTuple):
     """
-    An environment, and what is known of it.
+    An environment and its properties.
 
-    :param env_id: environment
-    :param names: of its observation's dimensions
-    :param ranges: of its observation's dimensions, widths
-    :param controller: a competent policy, of the true state
-    :param algorithm: name of the algorithm that learns on it
-    :param state: the environment's state that gives an observation
-    :param observe: the observation that a state gives
-    :param remark: what sets it apart from others with the same environment
+    :param env_id: id of the environment
+    :param names: names of the observation dimensions
+    :param ranges: widths of the observation dimensions
+    :param controller: a competent policy that maps true observations to actions
+    :param algorithm: the algorithm trained on it
+    :param state: maps an observation to the environment's state
+    :param observe: maps a state to an observation
+    :param remark: distinguishes cases with the same environment
     """
 
     env_id: str
@@ -159,22 +159,22 @@ CASES = [
     ),
 ]
 
-#: CartPole's observation space reaches twice as far as its episodes do: half of that noise.
+#: CartPole's observation space is twice as wide as the range of its episodes; this case has half of the noise.
 NARROW = CASES[1]._replace(ranges=(4.8, 6, 0.4189, 6), remark=" (range of its episodes)")
 
 
 class KalmanFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """
-    An extended Kalman filter that knows the dynamics and the noise. It does not know where the controller keeps the
-    state, which the table learns.
+    An extended Kalman filter that knows the dynamics and the noise. Unlike the table, it does not know in which states
+    the controller keeps the system.
 
     :param env: noisy environment
-    :param case: what is known of it
+    :param case: properties of the environment
     """
 
-    #: Variance of the process noise over that of the noise, for what linearising leaves out.
+    #: Variance of the process noise divided by that of the observation noise, to account for linearisation errors.
     PROCESS = 1e-4
-    #: Step of the differences that the dynamics are linearised by, over a dimension's range.
+    #: Step size of the finite differences that linearise the dynamics, as a share of a dimension's range.
     STEP = 1e-5
 
     def __init__(self, env: gym.Env[np.ndarray, Any], case: Case) -> None:
@@ -214,13 +214,13 @@ class KalmanFilter(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
 
 def estimates(env: gym.Env[np.ndarray, Any], case: Case, seed: int, n_steps: int) -> Iterator[tuple[np.ndarray, ...]]:
     """
-    Let the controller act on the true state.
+    Run the controller on the true state.
 
     :param env: filter around a :class:`NoisyObservation`
-    :param case: what it is of
+    :param case: properties of the environment
     :param seed: seed of the environment
-    :param n_steps: how many steps
-    :return: of each step the true observation and the estimate
+    :param n_steps: number of steps
+    :return: for each step the true observation and the estimate
     """
     noisy: Any = env.env
     env.reset(seed=seed)
@@ -234,10 +234,10 @@ def estimates(env: gym.Env[np.ndarray, Any], case: Case, seed: int, n_steps: int
 def error_ratio(filter_name: str, case: Case, seed: int, learning: int = LEARNING) -> np.ndarray:
     """
     :param filter_name: ``"filter"``, ``"algorithm 5"`` or ``"kalman"``
-    :param case: environment
+    :param case: the environment and its properties
     :param seed: seed of environment and noise
-    :param learning: how many steps the filter learns for before
-    :return: root mean square error of the estimates over the noise's standard deviation, after learning, (obs_dim,)
+    :param learning: number of learning steps before the measurement
+    :return: root mean square error of the estimates divided by the standard deviation of the noise, shape (obs_dim,)
     """
     noisy = NoisyObservation(gym.make(case.env_id), case.scale, seed)
     if filter_name == "kalman":
@@ -251,10 +251,10 @@ def error_ratio(filter_name: str, case: Case, seed: int, learning: int = LEARNIN
 
 def controller_return(case: Case, seed: int, filtered: bool) -> float:
     """
-    :param case: environment
-    :param seed: its seed
-    :param filtered: whether the controller acts on what the filter returns
-    :return: mean return of the controller without noise, of the episodes after ``LEARNING`` steps
+    :param case: the environment and its properties
+    :param seed: seed of the environment
+    :param filtered: whether the controller acts on the filter's estimates
+    :return: mean return of the controller without noise, over the episodes after ``LEARNING`` steps
     """
     env = DeltaFilter(gym.make(case.env_id)) if filtered else gym.make(case.env_id)
     observation, _ = env.reset(seed=seed)
@@ -273,10 +273,10 @@ def controller_return(case: Case, seed: int, filtered: bool) -> float:
 
 def make_noisy(case: Case, n_envs: int, seed: int, noise: bool) -> VecEnv:
     """
-    :param case: environment
-    :param n_envs: how many
-    :param seed: of environments and noise
-    :param noise: whether there is any
+    :param case: the environment and its properties
+    :param n_envs: number of environments
+    :param seed: seed of environments and noise
+    :param noise: whether to add noise
     :return: the environments
     """
     if not noise:
@@ -299,12 +299,12 @@ def shown(algorithm: str) -> str:
 
 def learned_return(case: Case, seed: int, noise: bool, filtered: bool, algorithm: str) -> float:
     """
-    :param case: environment
+    :param case: the environment and its properties
     :param seed: seed of everything
     :param noise: whether observations have noise, in training and evaluation
     :param filtered: whether they are filtered, in training and evaluation
     :param algorithm: name of an algorithm of this package, ``"dqn"`` or ``"random"``, with its defaults
-    :return: mean return of what was learned in ``LEARNING`` steps
+    :return: mean return after ``LEARNING`` training steps
     """
     th.set_num_threads(1)
     venv, evaluation = make_noisy(case, 1, seed, noise), make_noisy(case, 10, 10_000 + seed, noise)
@@ -336,9 +336,9 @@ def _random_return(venv: VecEnv) -> float:
 
 def step_times(case: Case, seed: int) -> tuple[float, float]:
     """
-    :param case: environment
-    :param seed: its seed
-    :return: seconds that a step takes without and with the filter, in a DummyVecEnv, the least of several times
+    :param case: the environment and its properties
+    :param seed: seed of the environment
+    :return: seconds of a step in a DummyVecEnv without and with the filter, the minimum of several measurements
     """
     times: list[list[float]] = [[], []]
     venvs = [DummyVecEnv([lambda: gym.make(case.env_id)]) for _ in range(2)]
@@ -347,7 +347,7 @@ def step_times(case: Case, seed: int) -> tuple[float, float]:
         venv.seed(seed)
         venv.reset()
     action = np.array([venvs[0].action_space.sample()])
-    # Short and often, so that some find the processor to themselves.
+    # Many short measurements, so that some are not disturbed by other processes.
     for _ in range(500):
         for index, venv in enumerate(venvs):
             begin = time.perf_counter()
@@ -359,8 +359,8 @@ def step_times(case: Case, seed: int) -> tuple[float, float]:
 
 def spread(figures: list[float]) -> str:
     """
-    :param figures: one of each seed
-    :return: their median, and 10 % and 90 % quantiles
+    :param figures: one value per seed
+    :return: their median with the 10 % and 90 % quantiles
     """
     low, median, high = np.quantile(figures, (0.1, 0.5, 0.9))
     return f"{median:.3g} ({low:.3g} to {high:.3g})"
@@ -407,7 +407,7 @@ def soon_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
 
 def harmless_table(pool: ProcessPoolExecutor, seeds: range) -> list[Row]:
     """Print and return the table ``harmless``."""
-    print("| environment | who acts | without filter | with filter |\n|---|---|---|---|")
+    print("| environment | agent | without filter | with filter |\n|---|---|---|---|")
     rows = []
     n = len(seeds)
     for case in CASES:
@@ -441,7 +441,7 @@ def learning_table(pool: ProcessPoolExecutor, seeds: range, algorithm: str) -> l
             )
         ]
         low, high, *reached = (statistics.median(returns) for returns in figures)
-        # Where nothing is learned without noise there is no way to go a share of.
+        # The share is undefined if nothing is learned without noise.
         shares = [f"{(value - low) / (high - low):.0%}" if high > low else "" for value in reached]
         print(f"| {' | '.join([case.env_id, shown(algorithm), *map(spread, figures), *shares])} |", flush=True)
         rows.append({"environment": case.env_id, "algorithm": algorithm, "returns": figures})
@@ -472,10 +472,10 @@ TABLES: dict[str, Callable[[ProcessPoolExecutor, range], list[Row]]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10, help="number of seeds")
-    parser.add_argument("--first-seed", type=int, default=100, help="the defaults were chosen on others")
+    parser.add_argument("--first-seed", type=int, default=100, help="100 to 109 were not used to choose the defaults")
     parser.add_argument("--workers", type=int, help="number of processes")
     parser.add_argument("--only", nargs="+", choices=TABLES, metavar="TABLE", help=", ".join(TABLES))
-    parser.add_argument("--json", metavar="FILE", help="also store every seed's figure")
+    parser.add_argument("--json", metavar="FILE", help="also store the result of every seed")
     arguments = parser.parse_args()
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     stored = {}

@@ -1,5 +1,5 @@
 """
-What a step of environments in processes costs: SB3's SubprocVecEnv and RayVecEnv, both on this machine.
+The time of a step of environments in separate processes: SB3's SubprocVecEnv and RayVecEnv, both on this machine.
 
     python -m benchmarks.ray_vec_env [--n-envs 2] [--repeats 5] [--json FILE]
 """
@@ -25,9 +25,9 @@ from sb3_knntd.distributed.ray_vec_env import RayVecEnv
 
 class Slow(gym.Env[np.ndarray, Any]):
     """
-    Waits, and has four numbers for an observation.
+    An environment whose steps only wait.
 
-    :param seconds: that a step takes
+    :param seconds: duration of a step
     """
 
     def __init__(self, seconds: float) -> None:
@@ -50,9 +50,9 @@ class Row(NamedTuple):
     """
     One line of the table.
 
-    :param seconds: that an environment takes for a step
-    :param subproc: milliseconds of a step of all environments in a SubprocVecEnv, the median of the repeats
-    :param ray: the same in a RayVecEnv
+    :param seconds: duration of a step of one environment
+    :param subproc: milliseconds of a step of all environments in a SubprocVecEnv, median of the repeats
+    :param ray: the same for a RayVecEnv
     """
 
     seconds: float
@@ -62,9 +62,9 @@ class Row(NamedTuple):
 
 def step_milliseconds(venv: VecEnv, seconds: float) -> float:
     """
-    :param venv: environments
-    :param seconds: how long to make steps
-    :return: milliseconds of a step of all
+    :param venv: the environments
+    :param seconds: duration of the measurement
+    :return: milliseconds of a step of all environments
     """
     actions = np.zeros(venv.num_envs, np.int64)
     n_steps, start = 0, time.perf_counter()
@@ -76,9 +76,9 @@ def step_milliseconds(venv: VecEnv, seconds: float) -> float:
 
 def measure(step_seconds: float, n_envs: int, repeats: int) -> Row:
     """
-    :param step_seconds: that an environment takes for a step
+    :param step_seconds: duration of a step of one environment
     :param n_envs: number of environments
-    :param repeats: how often both are timed, in turns, after one time that does not count
+    :param repeats: number of alternating measurements of both, after one warm-up
     """
     makers = [partial(Slow, step_seconds)] * n_envs
     venvs = [SubprocVecEnv(makers), RayVecEnv(makers, num_cpus=0)]
@@ -93,11 +93,11 @@ def measure(step_seconds: float, n_envs: int, repeats: int) -> Row:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n-envs", type=int, default=2, help="number of environments")
-    parser.add_argument("--repeats", type=int, default=5, help="how often both are timed")
+    parser.add_argument("--repeats", type=int, default=5, help="number of measurements")
     parser.add_argument("--json", metavar="FILE", help="also store the table")
     arguments = parser.parse_args()
     rows = [measure(seconds, arguments.n_envs, arguments.repeats) for seconds in (0.0, 0.01)]
-    print("| an environment's step, ms | SubprocVecEnv, ms | RayVecEnv, ms |")
+    print("| step of one environment, ms | SubprocVecEnv, ms | RayVecEnv, ms |")
     print("|---|---|---|")
     for row in rows:
         print(f"| {1e3 * row.seconds:g} | {row.subproc:.2f} | {row.ray:.2f} |")

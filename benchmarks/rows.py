@@ -1,4 +1,4 @@
-"""One line of the table that `python -m benchmarks.speed` prints."""
+"""A row of the table of `python -m benchmarks.speed`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import NamedTuple
 
 class Row(NamedTuple):
     """
+    The result of a comparison of two measurements.
+
     :param what: what was compared
-    :param ratio: the median ratio
-    :param low: the lowest of the repeats
-    :param high: the highest of the repeats
-    :param target: ``">= x"`` or ``"<= x"``
-    :param detail: the two things' own figures
+    :param ratio: median ratio over the repeats
+    :param low: lowest ratio
+    :param high: highest ratio
+    :param target: required ratio, ``">= x"`` or ``"<= x"``
+    :param detail: the absolute results of both measurements
     """
 
     what: str
@@ -28,10 +30,10 @@ class Row(NamedTuple):
     def of(cls, what: str, ratios: Sequence[float], target: str, detail: str) -> Row:
         """
         :param what: what was compared
-        :param ratios: one for each repeat
-        :param target: ``">= x"`` or ``"<= x"``
-        :param detail: the two things' own figures
-        :return: the line with their median and range
+        :param ratios: one ratio per repeat
+        :param target: required ratio, ``">= x"`` or ``"<= x"``
+        :param detail: the absolute results of both measurements
+        :return: the row with their median and range
         """
         return cls(what, statistics.median(ratios), min(ratios), max(ratios), target, detail)
 

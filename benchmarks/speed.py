@@ -1,5 +1,5 @@
 """
-Speed and scale, as ratios of two things run in this process one after the other, several times.
+Speed and scale, as ratios of two measurements that alternate in this process.
 
     python -m benchmarks.speed [--repeats 5] [--only WORD ...] [--json FILE]
 """
@@ -33,12 +33,12 @@ from sb3_knntd import KNNTD, ExA
 
 class Drift(gym.Env[np.ndarray, Any]):
     """
-    A walk in a box that costs next to nothing, so that the learner's own time shows: an action pushes one
-    dimension, a wall throws it back. Episodes end after ``length`` steps only.
+    A random walk in a box whose steps take almost no time, so that the time of the learner dominates. The action pushes
+    the first dimension. Episodes have ``length`` steps.
 
     :param obs_dim: number of dimensions
-    :param length: steps of an episode
-    :param continuous: whether actions are a Box
+    :param length: steps per episode
+    :param continuous: whether the action space is a Box
     """
 
     def __init__(self, obs_dim: int = 2, length: int = 200, continuous: bool = False) -> None:
@@ -66,11 +66,11 @@ def compare(
 ) -> Row:
     """
     :param what: name of the comparison
-    :param target: what the ratio ``one / other`` must reach
-    :param one: runs and returns its figure
-    :param other: runs and returns its figure
-    :param repeats: how often both are run, in turns, after one run that does not count
-    :param unit: of the figures
+    :param target: required ratio ``one / other``
+    :param one: the first measurement
+    :param other: the second measurement
+    :param repeats: number of alternating measurements of both, after one warm-up
+    :param unit: unit of the measurements
     """
     one(), other()
     pairs = [(one(), other()) for _ in range(repeats)]
@@ -81,8 +81,8 @@ def compare(
 
 def steps_per_second(work: Callable[[int], Any], n_steps: int) -> float:
     """
-    :param work: takes this number of environment steps
-    :param n_steps: how many
+    :param work: function that makes a given number of environment steps
+    :param n_steps: number of steps
     """
     start = time.perf_counter()
     work(n_steps)
@@ -90,7 +90,7 @@ def steps_per_second(work: Callable[[int], Any], n_steps: int) -> float:
 
 
 def bare_loop(venv: VecEnv, n_steps: int) -> None:
-    """Random actions, drawn beforehand, in an environment, without learning."""
+    """Steps with random actions, drawn beforehand, without learning."""
     random, space, size = np.random.default_rng(0), venv.action_space, (n_steps, venv.num_envs)
     if isinstance(space, spaces.Discrete):
         actions = random.integers(0, space.n, size)
@@ -103,24 +103,24 @@ def bare_loop(venv: VecEnv, n_steps: int) -> None:
 
 
 def paper_model(env: Any, points: Any = (20, 15), n_neighbors: int = 4, **arguments: Any) -> KNNTD:
-    """The paper's size of problem."""
+    """A model with the paper's number of points and neighbours."""
     return KNNTD(env, **{"points": points, "n_neighbors": n_neighbors, "trace_decay": 0.95, "seed": 0, **arguments})
 
 
 def continuous_model(env: Any, points: Any = (20, 15), n_neighbors: int = 8, **arguments: Any) -> ExA:
-    """Eleven action points and eight neighbours, as in the paper's Fig. 7."""
+    """A model with eleven action points and eight neighbours, as in the paper's figure 7."""
     given = {"action_points": 11, "points": points, "n_neighbors": n_neighbors, "trace_decay": 0.95, "seed": 0}
     return ExA(env, **{**given, **arguments})
 
 
 def learn_seconds(model: KNNTD | ExA, n_steps: int) -> float:
-    """Microseconds that a step takes in ``learn``."""
+    """Microseconds per step of ``learn``."""
     return 1e6 / steps_per_second(lambda n: model.learn(n), n_steps)
 
 
 def against_bare_loop(repeats: int, model: KNNTD | ExA, env_id: str, target: str) -> Row:
     venv = make_vec_env(env_id, model.n_envs, seed=0)
-    # Short runs in turns, so that a machine that is faster now and slower then is so for both.
+    # Short alternating runs, so that changes in the speed of the machine affect both.
     n_steps = 8_000
     return compare(
         f"{type(model).__name__}.learn over the bare loop, {env_id}, n_envs {model.n_envs}",
@@ -223,7 +223,7 @@ def over_neighbors(repeats: int) -> Row:
 
 
 class Stopwatch(BaseCallback):
-    """Notes the time of every thousandth step."""
+    """Records the time of every thousandth step."""
 
     def _init_callback(self) -> None:
         self.times: list[float] = []
@@ -242,7 +242,7 @@ def long_episode(repeats: int, continuous: bool) -> Row:
         watch = Stopwatch()
         model.learn(100_000, callback=watch)
         thousands = np.diff(watch.times)
-        # The first ten thousand steps warm up; a mean over five thousands evens out the machine's own unrest.
+        # The first ten thousand steps are a warm-up; medians over five thousand steps reduce fluctuations.
         first, last = np.median(thousands[9:14]), np.median(thousands[-5:])
         ratios.append(last / first)
         details.append((last * 1e3, first * 1e3))
@@ -344,7 +344,7 @@ def memory(repeats: int, dtype: th.dtype) -> Row:
 
 
 class Pauses(BaseCallback):
-    """Keeps the longest time between two steps."""
+    """Records the longest time between two steps."""
 
     def _init_callback(self) -> None:
         self.longest, self.last = 0.0, time.perf_counter()
@@ -372,9 +372,9 @@ def growth_pause(repeats: int) -> Row:
 
 
 def cuda(repeats: int) -> list[Row]:
-    """The torch path on an accelerator; nothing where there is none."""
+    """The torch step on a GPU; empty if there is none."""
     if not th.cuda.is_available():
-        print("device='cuda' is left out: there is no such device here", file=sys.stderr)
+        print("device='cuda' is skipped: no such device", file=sys.stderr)
         return []
     return against_copy(repeats)
 
@@ -404,7 +404,7 @@ BENCHMARKS: dict[str, Callable[[int], Row | list[Row]]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5, help="how often each pair is run")
+    parser.add_argument("--repeats", type=int, default=5, help="number of repeated measurements")
     parser.add_argument("--only", nargs="+", choices=BENCHMARKS, metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--json", metavar="FILE", help="also store the table")
     arguments = parser.parse_args()

@@ -1,12 +1,12 @@
 """
-The second look at a study: its best trials and the present configuration, each trained with several seeds.
+Retrain the best trials of a study and the present configuration with several seeds.
 
     python -m benchmarks.tuning --algo knntd --env Acrobot-v1 --storage studies/acrobot.log --study-name acrobot
                                 [--best N] [--seeds N] [--first-seed 50] [--episodes N] [--workers N] [--runs FOLDER]
 
-A study judges a trial by one training and the last evaluation. Here the best of them, their values rounded to two
-digits, are trained as ``python -m benchmarks.zoo`` does it, which also says what is needed. The best by the mean is
-printed as a configuration; seeds 100 to 109 are for reporting.
+A study judges a trial by the last evaluation of a single training. This script rounds the values of the best trials to
+two digits and trains them like ``python -m benchmarks.zoo``, which also lists the requirements. It prints the
+configuration with the best mean. Seeds 100 to 109 are reserved for reporting.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from sb3_knntd.distributed.jobs import Job, run_jobs
 from sb3_knntd.registry import ALGORITHMS, Role, with_role
 from sb3_knntd.zoo import register
 
-#: Name of the row of what ``zoo_configs/`` has.
+#: Name of the row for the configuration in ``zoo_configs/``.
 PRESENT = "present"
 
 
 def rounded(values: Mapping[str, Any], digits: int) -> dict[str, Any]:
     """
-    :param values: numbers and others
-    :param digits: how many significant ones floats keep
+    :param values: values of any type
+    :param digits: number of significant digits of floats
     :return: the values with rounded floats
     """
     return {key: float(f"{value:.{digits}g}") if isinstance(value, float) else value for key, value in values.items()}
@@ -41,10 +41,10 @@ def rounded(values: Mapping[str, Any], digits: int) -> dict[str, Any]:
 
 def candidates(algo: str, configuration: Mapping[str, Any], study: optuna.Study, best: int) -> dict[str, Any]:
     """
-    :param algo: algorithm
-    :param configuration: of the environment
-    :param study: on that environment
-    :param best: how many of the study's trials are taken
+    :param algo: name of the algorithm
+    :param configuration: configuration of the environment
+    :param study: study on that environment
+    :param best: number of best trials
     :return: configurations by name: ``"present"``, and the best trials by their numbers
     """
     done = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
@@ -59,20 +59,25 @@ def candidates(algo: str, configuration: Mapping[str, Any], study: optuna.Study,
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--algo", choices=with_role(Role.OWN), required=True)
-    parser.add_argument("--env", required=True, metavar="ID", help="an environment that has a configuration")
-    parser.add_argument("--storage", required=True, help="as of the study: a .log file or a database")
+    parser.add_argument("--env", required=True, metavar="ID", help="an environment with a configuration")
+    parser.add_argument("--storage", required=True, help="storage of the study: a .log file or a database")
     parser.add_argument("--study-name", required=True)
     parser.add_argument("--best", type=int, default=5, help="number of trials")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds for each")
     parser.add_argument("--first-seed", type=int, default=50)
-    parser.add_argument("--episodes", type=int, default=EPISODES, help="few do where all starts are alike")
-    parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
-    parser.add_argument("--runs", type=Path, default=Path("logs/tuning"), help="folder where runs are kept")
+    parser.add_argument(
+        "--episodes",
+        type=int,
+        default=EPISODES,
+        help="episodes per evaluation; a few are enough for a fixed initial state",
+    )
+    parser.add_argument("--workers", type=int, help="number of processes, by default one per core")
+    parser.add_argument("--runs", type=Path, default=Path("logs/tuning"), help="folder of the finished runs")
     arguments = parser.parse_args()
     algo, env_id = arguments.algo, arguments.env
     if (algo, env_id) not in configurations():
         there = ", ".join(known for other, known in configurations() if other == algo)
-        parser.error(f"--env: {algo} has no configuration of {env_id}; it has those of {there}")
+        parser.error(f"--env: {algo} has no configuration for {env_id}, only for {there}")
 
     storage = arguments.storage
     if storage.endswith(".log"):

@@ -1,13 +1,14 @@
 """
-The configurations of ``zoo_configs/`` beside RL Zoo's published figures.
+Results of the configurations in ``zoo_configs/``, compared with RL Zoo's published results.
 
     python -m benchmarks.zoo [--env ID ...] [--seeds N [ID=N ...]] [--first-seed 100] [--workers N] [--runs FOLDER]
                              [--json FILE] [--markdown FILE]
 
-For each environment of the files an agent is trained with each seed, as ``sb3-knntd train`` does it, and then plays 100
-greedy episodes in environments of its own. A run is kept in the folder and not done again until its configuration
-changes; after a change of the algorithms themselves, take another folder. Failures, such as a missing simulator, are
-reported at the end. All of them need ``pip install "gymnasium[box2d,mujoco,toy-text]"``.
+For each environment of the configuration files and each seed the script trains an agent like ``sb3-knntd train``
+and evaluates it over 100 greedy episodes in separate environments. Finished runs are kept in the folder and repeated
+only if their configuration changes; after a change of the algorithms themselves, use another folder. Failures, such as
+a missing simulator, are reported at the end. All environments need
+``pip install "gymnasium[box2d,mujoco,toy-text]"``.
 """
 
 from __future__ import annotations
@@ -42,24 +43,24 @@ from sb3_knntd.zoo import register
 from sb3_knntd.zoo.experiment import KNNExperimentManager
 
 EPISODES, EVALUATION_ENVS = 100, 10
-#: Environments for evaluation are seeded apart from those for training.
+#: Added to the seeds of evaluation environments.
 EVALUATION_SEED = 10_000
-#: After so many steps evaluation ends an episode in an environment that has no limit, where a policy may go in circles.
+#: Step limit of evaluation episodes in environments without one, in which a policy may move in circles.
 MOST_STEPS = 1000
 
-#: Where RL Zoo's figures are from.
+#: Source of RL Zoo's results.
 SOURCE = "https://github.com/DLR-RM/rl-baselines3-zoo/blob/0088472b8cb622732bdbc4aa3d0d0abde86c67ed/benchmark.md"
 
 
 class Published(NamedTuple):
     """
-    A line of RL Zoo's table, which is one run.
+    A line of RL Zoo's table, the result of one run.
 
-    :param algo: algorithm
-    :param env_id: environment, in the version of that time
+    :param algo: name of the algorithm
+    :param env_id: id of the environment, in the version of that time
     :param mean_reward: mean return
     :param std_reward: standard deviation over episodes
-    :param n_timesteps: steps of the training
+    :param n_timesteps: number of training steps
     """
 
     algo: str
@@ -95,13 +96,13 @@ PUBLISHED = (
 
 class Row(NamedTuple):
     """
-    What was learned in one environment.
+    The results on one environment.
 
-    :param algo: algorithm
-    :param env_id: environment
-    :param n_timesteps: steps of each training
-    :param seeds: one for each training
-    :param returns: of each episode, shape (n_seeds, n_episodes)
+    :param algo: name of the algorithm
+    :param env_id: id of the environment
+    :param n_timesteps: number of training steps
+    :param seeds: seeds of the runs
+    :param returns: return of each episode, shape (n_seeds, n_episodes)
     :param seconds: duration of each training
     """
 
@@ -115,7 +116,7 @@ class Row(NamedTuple):
 
 def configurations() -> dict[tuple[str, str], dict[str, Any]]:
     """
-    :return: what the files of ``zoo_configs/`` have for an environment, by algorithm and environment
+    :return: the configurations in ``zoo_configs/`` by algorithm and environment
     """
     paths = {name: algorithm.config_path for name, algorithm in with_role(Role.OWN).items()}
     stored = {algo: yaml.safe_load(path.read_text(encoding="utf-8")) for algo, path in paths.items() if path}
@@ -131,12 +132,12 @@ def configurations() -> dict[tuple[str, str], dict[str, Any]]:
 @stored_as("benchmarks.zoo.play", "__main__.play")
 def play(algo: str, env_id: str, settings: Mapping[str, Any], seed: int, episodes: int) -> dict[str, Any]:
     """
-    :param algo: algorithm
-    :param env_id: environment
-    :param settings: its configuration, in RL Zoo's form
-    :param seed: of the training; evaluation has another
-    :param episodes: how many are played greedily
-    :return: ``"returns"`` of the episodes, and the ``"seconds"`` that training took
+    :param algo: name of the algorithm
+    :param env_id: id of the environment
+    :param settings: configuration in RL Zoo's format
+    :param seed: seed of the training; evaluation uses another
+    :param episodes: number of greedy evaluation episodes
+    :return: the ``"returns"`` of the episodes, and the training time in ``"seconds"``
     """
     register()
     with TemporaryDirectory() as folder, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
@@ -157,7 +158,7 @@ def play(algo: str, env_id: str, settings: Mapping[str, Any], seed: int, episode
 
 
 def _evaluation_envs(manager: KNNExperimentManager, model: BaseAlgorithm, seed: int) -> VecEnv:
-    """Environments as those of the training, with its filter if it has one, which does not learn there."""
+    """Evaluation environments with the wrappers of the training environments, and the frozen filter if there is one."""
     assert model.env is not None
     manager.seed, manager.eval_env_kwargs = seed, manager.env_kwargs
     if gym.spec(manager.env_name.gym_id).max_episode_steps is None:
@@ -170,11 +171,11 @@ def _evaluation_envs(manager: KNNExperimentManager, model: BaseAlgorithm, seed: 
 
 def jobs(algo: str, env_id: str, settings: Mapping[str, Any], seeds: Sequence[int]) -> list[Job]:
     """
-    :param algo: algorithm
-    :param env_id: environment
-    :param settings: its configuration
-    :param seeds: one for each job
-    :return: what is to be played
+    :param algo: name of the algorithm
+    :param env_id: id of the environment
+    :param settings: configuration
+    :param seeds: one seed per job
+    :return: the jobs
     """
     name = env_id.replace("/", "-")
     arguments = {"algo": algo, "env_id": env_id, "settings": settings, "episodes": EPISODES}
@@ -183,8 +184,8 @@ def jobs(algo: str, env_id: str, settings: Mapping[str, Any], seeds: Sequence[in
 
 def summary(row: Row) -> dict[str, Any]:
     """
-    :param row: what was learned
-    :return: its figures, those of each seed in the order of the seeds
+    :param row: results on one environment
+    :return: their summary, with lists in the order of the seeds
     """
     return {
         "algo": row.algo,
@@ -200,8 +201,8 @@ def summary(row: Row) -> dict[str, Any]:
 
 def line(row: Row) -> list[str]:
     """
-    :param row: what was learned
-    :return: its line of the table
+    :param row: results on one environment
+    :return: cells of their line in the table
     """
     low, median, high = np.quantile(np.mean(row.returns, axis=1), (0.1, 0.5, 0.9))
     return [
@@ -219,8 +220,8 @@ def line(row: Row) -> list[str]:
 
 def published_line(figure: Published) -> list[str]:
     """
-    :param figure: of RL Zoo
-    :return: its line of the table
+    :param figure: a result of RL Zoo
+    :return: cells of its line in the table
     """
     reward = [f"{figure.mean_reward:.2f}", f"{figure.std_reward:.2f}"]
     return [figure.algo, figure.env_id, *reward, "", steps(figure.n_timesteps), "1", "", ""]
@@ -228,16 +229,16 @@ def published_line(figure: Published) -> list[str]:
 
 def steps(number: int) -> str:
     """
-    :param number: of steps
-    :return: as RL Zoo has it, ``20k`` or ``1M``
+    :param number: number of steps
+    :return: the number in RL Zoo's format, such as ``20k`` or ``1M``
     """
     return f"{number / 1e6:g}M" if number >= 1_000_000 else f"{number / 1e3:g}k"
 
 
 def table(rows: Sequence[Row]) -> str:
     """
-    :param rows: what was learned
-    :return: table in Markdown, each line followed by RL Zoo's on the environment of that name, whatever its version
+    :param rows: the results
+    :return: Markdown table, in which RL Zoo's results on any version of an environment follow those of this package
     """
     names = ["algo", "env_id", "mean_reward", "std_reward", "median [10 %, 90 %]"]
     names += ["n_timesteps", "seeds", "eval_episodes", "training"]
@@ -251,27 +252,27 @@ def table(rows: Sequence[Row]) -> str:
 
 def page(rows: Sequence[Row], command: str) -> str:
     """
-    :param rows: what was learned
-    :param command: what made them
+    :param rows: the results
+    :param command: the command that computed them
     :return: page in Markdown
     """
     machine = ", ".join(f"{key} {value}" for key, value in describe().items())
     first, last = min(min(row.seeds) for row in rows), max(max(row.seeds) for row in rows)
     return f"""# Benchmark
 
-The configurations of `zoo_configs/knntd.yml` and `exa.yml` in RL Zoo's form: mean and standard deviation of the return
-over all greedy episodes of all seeds, {EPISODES} for each seed. Then the median over seeds of a seed's mean return,
-with the 10 % and 90 % quantiles. Training is the wall-clock time of one training, the median over seeds. Seeds are
-{first} to {last}, others than those the configurations were tuned on.
+Results of the configurations in `zoo_configs/knntd.yml` and `exa.yml`, in the format of RL Zoo's benchmark.
+`mean_reward` and `std_reward` are over all greedy episodes of all seeds, {EPISODES} per seed. `median` is the median
+over the seeds of the mean return of a seed, with the 10 % and 90 % quantiles. `training` is the median wall-clock time
+of one training. The seeds are {first} to {last}, none of which were used for tuning.
 
-Lines with one seed and no time are RL Zoo's, from its
+Lines with one seed and no time are RL Zoo's results from its
 [benchmark.md]({SOURCE}),
-which are one run each and show what can be reached. They are of the environments' versions of that time, which can
-differ a little from today's. Where there is no such line RL Zoo has published none.
+one run each. They show what can be reached, on the environment versions of that time, which can differ slightly from
+the current ones. Environments without such a line have no published result.
 
 {table(rows)}
 
-Made by
+Computed by
 
 ```bash
 pip install ".[zoo]" "gymnasium[box2d,mujoco,toy-text]"
@@ -286,7 +287,7 @@ def seeds_of(words: Sequence[str]) -> tuple[int, dict[str, int]]:
     """
     :param words: a number of seeds, and exceptions as ``ID=N``
     :return: the number, and the exceptions by environment
-    :raises ValueError: if a word is neither, or a number is below 1
+    :raises ValueError: if a word is invalid, or a number is below 1
     """
     number, exceptions = 10, {}
     for word in words:
@@ -304,10 +305,10 @@ def learn(
     seeds: Mapping[tuple[str, str], Sequence[int]], runs: Path, workers: int | None
 ) -> tuple[list[Row], dict[str, str]]:
     """
-    :param seeds: of the configurations that are wanted
-    :param runs: folder where runs are kept
-    :param workers: number of processes; by default one a core
-    :return: what was learned, and by job why it could not be
+    :param seeds: seeds by algorithm and environment
+    :param runs: folder of the finished runs
+    :param workers: number of processes; by default one per core
+    :return: the results, and the errors by job
     """
     known = configurations()
     wanted = {(algo, env_id): jobs(algo, env_id, known[algo, env_id], some) for (algo, env_id), some in seeds.items()}
@@ -335,10 +336,10 @@ def main() -> None:
     env_ids = list(dict.fromkeys(env_id for _, env_id in known))
     parser.add_argument("--env", nargs="+", choices=env_ids, metavar="ID", help=", ".join(env_ids))
     parser.add_argument("--seeds", nargs="+", default=["10"], metavar="N", help="number of seeds, and exceptions: ID=N")
-    parser.add_argument("--first-seed", type=int, default=100, help="the configurations were tuned on others")
-    parser.add_argument("--workers", type=int, help="number of processes, by default one a core")
-    parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"), help="folder where runs are kept")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also store every seed's figures")
+    parser.add_argument("--first-seed", type=int, default=100, help="seeds 100 to 109 were not used for tuning")
+    parser.add_argument("--workers", type=int, help="number of processes, by default one per core")
+    parser.add_argument("--runs", type=Path, default=Path("logs/benchmark"), help="folder of the finished runs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also store the results of every seed")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="also write the page of the documentation")
     arguments = parser.parse_args()
     try:

@@ -1,4 +1,4 @@
-"""Settings of Sphinx. Build with ``make docs``."""
+"""Sphinx configuration. Build with ``make docs``."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ smartquotes = False
 html_theme = "furo"
 html_title = f"sb3-knntd {version}"
 
-# Every reference must lead somewhere; `make docs` turns warnings into errors. Names of other projects and of the
-# kernels, which no page describes, stay plain text.
+# Every reference must resolve; `make docs` turns warnings into errors. Names of other projects and of the kernels,
+# which have no page, stay plain text.
 nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!sb3_knntd\b)\w+\..*"),
     (r"py:.*", r"sb3_knntd\.kernels\..*"),
-    # Imported for type checkers alone, type variables, and names of types.
+    # Names imported only for type checking, type variables and type aliases.
     (r"py:.*", r"Axes|BaseCallback|Figure|Path|VecEnv|GymEnv|MaybeCallback|Schedule|State"),
     (r"py:.*", r"(sb3_knntd\..*\.)?(Self\w+|Function)"),
     (r"py:.*", r"ActionColumns|Exploration|RandomStream"),
@@ -51,7 +51,7 @@ add_module_names = False
 python_use_unqualified_type_names = True
 maximum_signature_line_length = 88
 
-# Publishers turn robots away.
+# Publishers block automated requests.
 linkcheck_ignore = [r"https://doi\.org/.*"]
 
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
@@ -59,7 +59,7 @@ copybutton_prompt_is_regexp = True
 
 
 def insert_docstrings(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Put the docstrings of environments, which are Markdown as in gymnasium, where ``{docstring}`` names them."""
+    """Replace ``{docstring}`` blocks by the docstrings of environments, which are Markdown as in gymnasium."""
 
     def docstring(match: re.Match[str]) -> str:
         module, name = match[1].rsplit(".", 1)
@@ -69,12 +69,12 @@ def insert_docstrings(app: Sphinx, docname: str, source: list[str]) -> None:
 
 
 def escape_stars(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """The star of a shape, (n_envs, *obs_shape), and of e *= γ λ is no emphasis."""
+    """Escape the stars in shapes, (n_envs, *obs_shape), and in e *= γ λ, which are no emphasis."""
     lines[:] = [re.sub(r"(?<=[ (])\*(?=\w+\)|=)", r"\\*", line) for line in lines]
 
 
 def copy_notebooks(app: Sphinx) -> None:
-    """Sphinx reads what is below its own folder only."""
+    """Copy the notebooks of ``examples/``, because Sphinx only reads files below its own folder."""
     for notebook in (HERE.parent / "examples").glob("*.ipynb"):
         shutil.copy2(notebook, HERE / "examples")
 

@@ -1,9 +1,9 @@
 """
-Draw the pictures of docs/algorithm.md.
+Draw the figures of docs/algorithm.md.
 
     python docs/pictures.py [FOLDER]
 
-They are drawn from models that are trained here, with fixed seeds: the same version draws the same pictures.
+The script trains the models with fixed seeds, so the same version draws the same figures.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from sb3_knntd import KNNTD, ExA
 from sb3_knntd.plots import BASELINE_COLOR, LINE_COLOR, NAMES, UNLEARNED_COLOR, ValueGrid, new_figure, value_grid
 
 POSITION, VELOCITY = NAMES["MountainCar-v0"].observations
-#: Dots of points that play no part.
+#: Colour of points that are not neighbours.
 POINT_COLOR = "0.75"
 
 
 def neighbors() -> Figure:
-    """An observation between the points of a lattice, its neighbours, and how much each counts."""
+    """An observation between the points of a lattice, its neighbours and their weights."""
     figure = new_figure(10.5, 4.2)
     observation = np.array([-0.43, 0.012], np.float32)
     spacing = 2 / 11
     settings: dict[str, dict[str, Any]] = {
         "n_neighbors=4": {"n_neighbors": 4},
         "n_neighbors=9": {"n_neighbors": 9},
-        'n_neighbors=9, weights="gaussian",\nbandwidth: one spacing of the points': {
+        'n_neighbors=9, weights="gaussian",\nbandwidth: one lattice spacing': {
             "n_neighbors": 9,
             "weights": "gaussian",
             "bandwidth": spacing,
@@ -48,7 +48,7 @@ def neighbors() -> Figure:
         axes.plot(*points.T, "o", color=POINT_COLOR, markersize=4)
         for point, probability in zip(points[indices], probabilities, strict=True):
             axes.plot(*zip(observation, point, strict=True), color=LINE_COLOR, linewidth=1, alpha=0.5)
-            # Its area is how much it counts.
+            # The area is proportional to the weight.
             size = 44 * np.sqrt(probability)
             axes.plot(*point, "o", color=LINE_COLOR, markersize=size)
             offset = 0.36 * size + 1
@@ -62,25 +62,25 @@ def neighbors() -> Figure:
     return figure
 
 
-class Route(BaseCallback):
-    """Keeps where the environment went."""
+class Trajectory(BaseCallback):
+    """Record the observations."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.route: list[np.ndarray] = []
+        self.observations: list[np.ndarray] = []
 
     def _on_step(self) -> bool:
-        self.route.append(self.locals["new_obs"][0].copy())
+        self.observations.append(self.locals["new_obs"][0].copy())
         return True
 
 
 def traces() -> Figure:
-    """What is left of the traces along one route, by λ."""
+    """The traces along one trajectory for several values of λ."""
     figure = new_figure(10.5, 3.9)
     trained = KNNTD("MountainCar-v0", points=(20, 20), n_neighbors=4, seed=0).learn(30_000)
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     for axes, trace_decay in zip(panels, (0.5, 0.9, 0.98), strict=True):
-        # A learning rate of 0 leaves the table as it is: the way is the same for every λ.
+        # A learning rate of 0 does not change the table, so the trajectory is the same for every λ.
         model = KNNTD(
             "MountainCar-v0",
             points=(20, 20),
@@ -91,17 +91,17 @@ def traces() -> Figure:
             exploration_initial_eps=0.0,
         )
         model.policy.load_state_dict(trained.policy.state_dict())
-        callback = Route()
+        callback = Trajectory()
         model.learn(75, callback=callback)
         state = model.learner.state_dict()["traces"]
-        # Whichever action it is for.
+        # The largest trace over the actions.
         eligibility = (state["traces"][..., 0].amax(dim=1) * state["pace"][0]).numpy()
         points = model.policy.points.numpy()
         axes.plot(*points.T, "o", color=POINT_COLOR, markersize=2)
         marks = axes.scatter(
             *points[state["points"]].T, c=eligibility, s=46, cmap="viridis_r", norm=LogNorm(1e-4, 0.3), zorder=3
         )
-        x, y = np.transpose(callback.route)
+        x, y = np.transpose(callback.observations)
         axes.plot(x, y, color=BASELINE_COLOR, linewidth=1.5, zorder=4)
         axes.plot(x[-1], y[-1], "X", color=BASELINE_COLOR, markersize=11, markeredgecolor="white", zorder=5)
         axes.set(title=f"λ = {trace_decay}", xlabel=POSITION)
@@ -112,9 +112,9 @@ def traces() -> Figure:
 
 class Growth(BaseCallback):
     """
-    Keeps what a model says at the end of some episodes.
+    Record the value grid at the end of some episodes.
 
-    :param episodes: which, counted from 1
+    :param episodes: numbers of the episodes, counted from 1
     """
 
     def __init__(self, episodes: tuple[int, ...]) -> None:
@@ -131,7 +131,7 @@ class Growth(BaseCallback):
 
 
 def growth() -> Figure:
-    """How values spread from the goal, over the episodes of one run."""
+    """The propagation of values from the goal over the episodes of one run."""
     figure = new_figure(10.5, 5.2)
     callback = Growth((1, 10, 50, 400))
     KNNTD("MountainCar-v0", seed=0).learn(60_000, callback=callback)
@@ -158,11 +158,11 @@ def growth() -> Figure:
 
 
 def continuous_action() -> Figure:
-    """What each neighbour recommends, and the mean that ExA takes of it."""
+    """The recommendations of the neighbours, and their mean, the action of ExA."""
     figure = new_figure(10.5, 4.2)
     settings: dict[str, Any] = {"points": (15, 15), "n_neighbors": 9, "action_points": 3, "seed": 0}
     policy = ExA("MountainCarContinuous-v0", **settings).learn(20_000).policy
-    # The same table, read with other weights.
+    # The same table with other weights.
     smoother = ExA("MountainCarContinuous-v0", weights="gaussian", bandwidth=2 / 14, **settings).policy
     smoother.load_state_dict(policy.state_dict())
     points, best = policy.points.numpy(), policy.action_points[0][policy.q_table.argmax(dim=1)].numpy()

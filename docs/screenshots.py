@@ -1,6 +1,6 @@
 """
-Draw the pictures of docs/callbacks.md: train both algorithms with every callback, open their logs in TensorBoard with a
-headless Chromium, and take a picture of what it shows.
+Make the images of docs/callbacks.md: train both algorithms with every callback, open their logs in TensorBoard with a
+headless Chromium, and take screenshots.
 
     python docs/screenshots.py [--out FOLDER]
 """
@@ -32,7 +32,7 @@ from sb3_knntd.registry import ALGORITHMS
 
 #: By algorithm, the environment that it learns, and the two dimensions that are drawn.
 RUNS = {"knntd": ("MountainCar-v0", (0, 1)), "exa": ("Pendulum-v1", (0, 2))}
-#: Where TensorBoard says it can be reached.
+#: TensorBoard's address in its output.
 ADDRESS = re.compile(r"http://\S+:\d+/")
 CHROMIUM = "chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 CHROMIUM_ARGUMENTS = [
@@ -45,7 +45,7 @@ CHROMIUM_ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-#: What a run with all callbacks logs besides what it logs without.
+#: Scalars logged by the callbacks.
 SCALARS = [
     "perception/neighbors",
     "perception/outside_share",
@@ -59,7 +59,7 @@ SCALARS = [
 ]
 IMAGES = ["map/value", "video/episode"]
 FILTER = "^perception|td_error_q|trace|policy"
-#: TensorBoard's tabs, and width and height of the window that shows all there is.
+#: TensorBoard's tabs, and the window size (width, height) that shows their whole content.
 TABS = {"scalars": (1420, 1080), "images": (1420, 820), "hparams": (1420, 420)}
 TIMEOUT = 60_000
 
@@ -68,10 +68,10 @@ def train(folder: Path, n_steps: int, n_pictures: int) -> Path:
     """
     Train each algorithm of :data:`RUNS` with all callbacks.
 
-    :param folder: where files are written, a folder for each algorithm
-    :param n_steps: number of steps of each
-    :param n_pictures: how many maps and videos are made of each
-    :return: where TensorBoard's logs are
+    :param folder: output folder, with one subfolder per algorithm
+    :param n_steps: number of training steps per algorithm
+    :param n_pictures: number of maps and of videos per algorithm
+    :return: folder of TensorBoard's logs
     """
     for name, (env_id, dims) in RUNS.items():
         files, freq = folder / name, n_steps // n_pictures
@@ -98,16 +98,16 @@ def find_chromium() -> str | None:
 @contextmanager
 def open_tensorboard(logs: Path) -> Iterator[tuple[str, Page]]:
     """
-    Start TensorBoard, and a browser.
+    Start TensorBoard and a browser.
 
-    :param logs: where TensorBoard's logs are
-    :return: TensorBoard's address, and a page of the browser
+    :param logs: folder of TensorBoard's logs
+    :return: TensorBoard's address, and a browser page
     :raises FileNotFoundError: if there is no Chromium
     """
     chromium = find_chromium()
     if chromium is None:
         raise FileNotFoundError(f"no Chromium: none of {', '.join(CHROMIUM)} is on the PATH")
-    # From the folder above, as the page shows the path it was given.
+    # Run in the parent folder, because TensorBoard displays the path it was given.
     command = [sys.executable, "-m", "tensorboard.main", "--logdir", logs.name, "--host", "127.0.0.1", "--port", "0"]
     with subprocess.Popen(command, cwd=logs.parent, stderr=subprocess.PIPE, text=True) as board:
         try:
@@ -127,17 +127,17 @@ def show(page: Page, url: str, tab: str) -> None:
     """
     Open one of TensorBoard's tabs and wait until it shows what was logged.
 
-    :param page: of :func:`open_tensorboard`
-    :param url: of :func:`open_tensorboard`
+    :param page: browser page from :func:`open_tensorboard`
+    :param url: address from :func:`open_tensorboard`
     :param tab: ``"scalars"``, ``"images"`` or ``"hparams"``
     :raises playwright.sync_api.TimeoutError: if something does not appear
     """
     width, height = TABS[tab]
     page.set_viewport_size({"width": width, "height": height})
-    # The query has it loaded anew: another fragment alone would not.
+    # The query forces a reload; a new fragment alone would not.
     page.goto(f"{url}?{tab}#{tab}")
     if tab == "scalars":
-        # Groups after the first two are folded up; what a filter lets through is not.
+        # Only the first two groups are expanded; filter results always are.
         page.locator("tf-tag-filterer input").fill(FILTER)
         for tag in SCALARS:
             page.locator("tf-card-heading", has_text=tag).first.wait_for()
@@ -147,7 +147,7 @@ def show(page: Page, url: str, tab: str) -> None:
     else:
         page.get_by_text("rollout/ep_rew_mean").first.wait_for()
         page.get_by_text("KNNTD_1").first.wait_for()
-    # Curves and pictures come in moving.
+    # Wait for the animations to finish.
     page.wait_for_timeout(2000)
 
 

@@ -3,8 +3,8 @@ Tabular SARSA and Q-learning on the cliff of Sutton and Barto's "Reinforcement L
 
     python examples/cliff_walking.py
 
-Q-learning learns the shortest way, along the edge, from which its exploration keeps falling; SARSA learns to keep its
-distance, and earns more while it explores.
+Q-learning learns the shortest path, along the edge, and keeps falling off while it explores. SARSA learns a safer path
+further away, and has higher returns during training.
 """
 
 import numpy as np
@@ -16,20 +16,20 @@ ROWS, COLUMNS = 4, 12
 ARROWS = np.array(list("↑→↓←"))
 
 
-def greedy_route(model: KNNTD, env: VecEnv) -> list[int]:
+def greedy_path(model: KNNTD, env: VecEnv) -> list[int]:
     """
-    :param model: a model of CliffWalking
+    :param model: a model trained on CliffWalking
     :param env: one environment
-    :return: the states that the greedy policy goes through, the start first
+    :return: the states that the greedy policy visits, including the initial state
     """
     state, done = env.reset(), False
-    route = [int(state[0])]
-    while not done and len(route) <= ROWS * COLUMNS:
+    path = [int(state[0])]
+    while not done and len(path) <= ROWS * COLUMNS:
         action, _ = model.predict(state, deterministic=True)
         state, _, dones, infos = env.step(action)
         done = bool(dones[0])
-        route.append(int(infos[0]["terminal_observation"] if done else state[0]))
-    return route
+        path.append(int(infos[0]["terminal_observation"] if done else state[0]))
+    return path
 
 
 def main() -> None:
@@ -45,14 +45,14 @@ def main() -> None:
         )
         model.learn(30_000)
         returns = [episode["r"] for episode in model.ep_info_buffer]
-        route = greedy_route(model, model.get_env())
+        path = greedy_path(model, model.get_env())
 
         cells = np.full(ROWS * COLUMNS, "·")
         cells[37:47] = "▒"
         best = model.policy.q_table.argmax(dim=1).numpy()
-        cells[route[:-1]] = ARROWS[best[route[:-1]]]
+        cells[path[:-1]] = ARROWS[best[path[:-1]]]
         cells[47] = "G"
-        print(f"{target}: greedy route of {len(route) - 1} steps, return while training {np.mean(returns):.1f}")
+        print(f"{target}: greedy path of {len(path) - 1} steps, mean training return {np.mean(returns):.1f}")
         print("\n".join("  " + " ".join(row) for row in cells.reshape(ROWS, COLUMNS)), end="\n\n")
 
 

@@ -1,12 +1,12 @@
 """
-The δs filter from scratch: Algorithm 5 in plain NumPy, taking noise out of the observations of a Mountain-Car.
+The δs filter from scratch: Algorithm 5 in plain NumPy, which removes noise from the observations of Mountain-Car.
 
     python examples/delta_filter_from_scratch.py [--steps 20000] [--seed 0]
 
-Perception is that of knn_td_from_scratch.py, to be read first. Equation and algorithm numbers are those of Martin H.,
+Read knn_td_from_scratch.py first, which defines perception. Equation and algorithm numbers are those of Martin H.,
 de Lope and Maravall, "Robust high performance reinforcement learning through weighted k-nearest neighbors"
-(Neurocomputing 74, 2011). Nothing is optimised or shared with the package. The package's filter adapts its gain to the
-noise, and takes out more; with ``gain=None`` it is this one, which the tests compare it with.
+(Neurocomputing 74, 2011). The code is not optimised, and shares nothing with the package. The package's filter adapts
+its gain to the noise, and removes more of it. With ``gain=None`` it is this filter; the tests compare both.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ from numpy.typing import ArrayLike
 
 class PaperFilter:
     """
-    Algorithm 5: learn the change of the state at each point for each action, and return the state that the change leads
-    to in place of the one observed.
+    Algorithm 5: learn the change of the state at each point for each action, and return the predicted state instead of
+    the observed one.
 
     :param perceive: maps a state to its neighbours
-    :param own_errors: whether δ(knn, a) in line 4 is read as the list of the neighbours' values, so that each learns
-        from an error of its own; otherwise as their mean, from whose error all learn
+    :param n_actions: number of actions
+    :param obs_dim: dimension of the state
+    :param own_errors: how to read δ(knn, a) in line 4: as the list of the neighbours' values, so that each neighbour
+        has its own error (True), or as their mean, so that all have the same error (False)
     """
 
     def __init__(self, perceive: Perceiver, n_actions: int, obs_dim: int, own_errors: bool = False) -> None:
@@ -39,7 +41,7 @@ class PaperFilter:
         """
         Learn from one transition.
 
-        :param state: where the step began, as last returned by the filter
+        :param state: the state before the step, as returned by the previous call
         :param action: the action taken there
         :param observed: the noisy observation after the step
         :param alpha: learning rate
@@ -73,9 +75,9 @@ def main() -> None:
     for _ in range(arguments.steps):
         if ended:
             truth, _ = env.reset()
-            # An episode begins with its first observation.
+            # The first estimate of an episode is its first observation.
             estimate = truth + rng.normal(0.0, noise)
-        # A controller that knows the true state and always drives on: right if it rolls to the right, else left.
+        # A controller that knows the true state and pushes in the direction of the velocity.
         action = 2 if truth[1] > 0 else 0
         truth, _, terminated, truncated, _ = env.step(action)
         observed = truth + rng.normal(0.0, noise)

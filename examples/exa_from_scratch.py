@@ -4,10 +4,10 @@ with a continuous force.
 
     python examples/exa_from_scratch.py [--episodes 40] [--seed 0]
 
-Perception and the step of the table are those of knn_td_from_scratch.py, to be read first. Equation and algorithm
-numbers are those of Martin H., de Lope and Maravall, "Robust high performance reinforcement learning through weighted
-k-nearest neighbors" (Neurocomputing 74, 2011). Nothing is optimised or shared with the package, whose results the tests
-compare with this file's.
+Read knn_td_from_scratch.py first, which defines perception and the update of the table. Equation and algorithm numbers
+are those of Martin H., de Lope and Maravall, "Robust high performance reinforcement learning through weighted k-nearest
+neighbors" (Neurocomputing 74, 2011). The code is not optimised, and shares nothing with the package. The tests compare
+the package with this file.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from numpy.typing import NDArray
 
 # --------------------------------------------------------------------------------------------------- 1. the agent
 #
-# The table has a column for each of a few action points. Every neighbour proposes an action point of its own, and the
-# action is the mean of the proposals, weighted by p. With several action dimensions the table has either one part, with
-# a column for each combination of their points, or a part for each dimension.
+# The table has one column for each of a few action points. Every neighbour recommends one action point, and the action
+# is the mean of the recommendations, weighted by p. With several action dimensions the table has either a single part,
+# with one column for each combination of action points, or one part per dimension.
 
 
 class Choice(NamedTuple):
     """
-    What every neighbour proposes.
+    The recommendations of the neighbours.
 
     :param neighbours: the perception of the observation
-    :param columns: the proposed column in each part of the table, shape (k, n_parts)
+    :param columns: the recommended column in each part of the table, shape (k, n_parts)
     """
 
     neighbours: Neighbours
@@ -48,8 +48,9 @@ class Transition:
     """
     One step of one environment.
 
-    :param choice: the proposals that made the action
-    :param next_state: the observation after the step; at the end of an episode its last one, not the next one's first
+    :param choice: the recommendations that gave the action
+    :param next_state: the observation after the step; at the end of an episode its last observation, not the first one
+        of the next episode
     """
 
     choice: Choice
@@ -64,11 +65,11 @@ class ExAAgent:
     Algorithm 4, with one table for ``n_envs`` environments, each of which has its own traces.
 
     :param perceive: maps an observation to its neighbours
-    :param action_points: of each action dimension (eq. 19)
-    :param factored: whether each dimension has a part of the table, rather than one part for their combinations
+    :param action_points: the action points of each action dimension (eq. 19)
+    :param factored: whether each dimension has its own part of the table, or one part holds all combinations
     :param gamma: discount factor
     :param traces: ``"replacing"`` or ``"accumulating"``
-    :param reset_other_actions: whether replacing traces clear those of the columns that were not proposed
+    :param reset_other_actions: whether replacing traces clear those of the columns that were not recommended
     :param step_size: ``"paper"`` for α, or ``"normalized"`` for α / Σp²
     """
 
@@ -108,20 +109,20 @@ class ExAAgent:
     # Acting
 
     def recommend(self, state: Any) -> Choice:
-        """Eq. 20: every neighbour proposes the best column of its own row; of several the first."""
+        """Eq. 20: every neighbour recommends the best column of its own row, the first in case of ties."""
         neighbours = self.perceive(state)
         best = [table[neighbours.indices].argmax(axis=1) for table in self.tables]
         return Choice(neighbours, np.stack(best, axis=1))
 
     def explore(self, choice: Choice, epsilon: float, rng: np.random.Generator) -> Choice:
-        """With probability ε all neighbours propose the same column instead, drawn at random."""
+        """With probability ε all neighbours recommend the same random column instead."""
         if rng.random() >= epsilon:
             return choice
         column = [rng.integers(len(part)) for part in self.parts]
         return Choice(choice.neighbours, np.tile(column, (len(choice.columns), 1)))
 
     def action(self, choice: Choice) -> Array:
-        """Eq. 21: the mean of the proposals, shape (n_dims,)."""
+        """Eq. 21: the weighted mean of the recommendations, shape (n_dims,)."""
         p = choice.neighbours.probabilities
         means = [
             (p[:, None] * part[column]).sum(axis=0) for part, column in zip(self.parts, choice.columns.T, strict=True)
@@ -131,17 +132,17 @@ class ExAAgent:
     # Learning
 
     def state_value(self, neighbours: Neighbours) -> float:
-        """Eq. 25: the mean of the neighbours' best values, and over the parts."""
+        """Eq. 25: the weighted mean of the neighbours' best values, averaged over the parts."""
         indices, p = neighbours
         return float(np.mean([np.sum(p * table[indices].max(axis=1)) for table in self.tables]))
 
     def td_error(self, step: Transition) -> float:
-        """Eq. 24: δ. After a terminal state nothing follows; a time limit ends nothing."""
+        """Eq. 24: δ. The value after a terminal state is 0; after a truncation the target bootstraps."""
         next_value = 0.0 if step.terminated else self.state_value(self.perceive(step.next_state))
         return step.reward + self.gamma * next_value - self.state_value(step.choice.neighbours)
 
     def set_traces(self, env: int, choice: Choice) -> None:
-        """Eq. 26: every neighbour becomes eligible, for the column that it proposed."""
+        """Eq. 26: set the trace of every neighbour at the column that it recommended."""
         indices, p = choice.neighbours
         for traces, column in zip(self.traces, choice.columns.T, strict=True):
             if self.trace_kind == "accumulating":
@@ -163,7 +164,7 @@ class ExAAgent:
 
     def learn(self, steps: Sequence[Transition], rates: Rates) -> None:
         """Learn from one step of every environment."""
-        # All errors before any change: no environment sees what another has just learned.
+        # Compute all errors before the update: no environment uses values that another has just updated.
         scaled_errors = np.array([self.alpha(step, rates) * self.td_error(step) for step in steps])
         for env, step in enumerate(steps):
             self.set_traces(env, step.choice)
@@ -179,7 +180,7 @@ class ExAAgent:
 
 
 def train(env: gym.Env[Any, Any], agent: ExAAgent, rates: Rates, n_episodes: int, seed: int) -> list[float]:
-    """Algorithm 4 in one environment, ε falling to 0 over the episodes. Returns the return of each episode."""
+    """Algorithm 4 in one environment, with ε decreasing to 0 over the episodes. Returns the return of each episode."""
     rng = np.random.default_rng(seed)
     env.reset(seed=seed)
     returns = []

@@ -5,8 +5,8 @@ kNN-TD(λ) from scratch: the whole algorithm in plain NumPy, and a training loop
 
 Read it from top to bottom: perception, values, learning, training. Equation, line and algorithm numbers are those of
 Martin H., de Lope and Maravall, "Robust high performance reinforcement learning through weighted k-nearest neighbors"
-(Neurocomputing 74, 2011). Arrays are whole and nothing is optimised or shared with the package, whose results the tests
-compare with this file's.
+(Neurocomputing 74, 2011). The code uses dense arrays, is not optimised, and shares nothing with the package. The tests
+compare the package with this file.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Weights = str | Callable[[Array], Array]
 
 # ------------------------------------------------------------------------------------------------- 1. perception
 #
-# An observation is perceived through the k points nearest to it. Each has a probability p, the larger the nearer it is.
+# An observation is represented by its k nearest points. Each has a probability p, which is larger for nearer points.
 
 
 class Neighbours(NamedTuple):
@@ -35,7 +35,7 @@ class Neighbours(NamedTuple):
     The perception of one observation.
 
     :param indices: the k nearest points, nearest first, shape (k,)
-    :param probabilities: how much each counts, shape (k,), with sum 1
+    :param probabilities: their weights, shape (k,), with sum 1
     """
 
     indices: NDArray[np.int64]
@@ -51,13 +51,13 @@ class Perceiver(Protocol):
 
 
 def scale(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
-    """Eq. 4: map the range from low to high to [-1, 1]. What lies outside the range is not clipped."""
+    """Eq. 4: map the range from low to high to [-1, 1]. Values outside the range are not clipped."""
     at, start, end = (np.asarray(v, dtype=np.float64) for v in (x, low, high))
     return np.asarray(2.0 * (at - start) / (end - start) - 1.0)
 
 
 def lattice(sizes: Sequence[int]) -> Array:
-    """All points of a regular grid over [-1, 1]^d, shape (n_points, d), the last dimension running fastest."""
+    """All points of a regular grid over [-1, 1]^d, shape (n_points, d), the last dimension varying fastest."""
     axes = np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in sizes), indexing="ij")
     return np.stack([axis.ravel() for axis in axes], axis=1)
 
@@ -65,21 +65,20 @@ def lattice(sizes: Sequence[int]) -> Array:
 def squared_distances(x: Array, points: Array) -> Array:
     """Squared Euclidean distances from one scaled observation to all scaled points, shape (n_points,)."""
     total = np.zeros(len(points))
-    # The order of the sum is part of the definition: it decides which distances come out exactly equal.
+    # The order of summation is part of the definition: it determines which distances are exactly equal.
     for j in range(points.shape[1]):
         total += (x[j] - points[:, j]) ** 2
     return total
 
 
 def weigh(squared: Array, weights: Weights, bandwidth: float) -> Array:
-    """Eq. 5 and alternatives to it: the weights of the neighbours before they are normalised."""
+    """Eq. 5 and alternatives: the weights of the neighbours before normalisation."""
     if callable(weights):
         return np.asarray(weights(squared), dtype=np.float64)
     if weights == "inverse_quadratic":
         return np.asarray(1.0 / (1.0 + squared / bandwidth**2))
     if weights == "gaussian":
-        # Subtracting the minimum leaves the probabilities as they are, and avoids 0 / 0 where every exponential
-        # would underflow.
+        # Subtracting the minimum does not change the probabilities, and avoids 0 / 0 if all exponentials underflow.
         return np.asarray(np.exp(-(squared - squared.min()) / (2.0 * bandwidth**2)))
     raise ValueError(weights)
 
@@ -88,12 +87,12 @@ class NearestPoints:
     """
     Perceive a continuous observation by its k nearest points (eqs. 4 to 6).
 
-    :param points: number of points in each dimension (a lattice), or the points themselves in observation units,
-        shape (n_points, obs_dim)
-    :param bounds: lowest and highest value of each dimension
+    :param points: number of points per dimension (a lattice), or the points in observation units, shape
+        (n_points, obs_dim)
+    :param bounds: smallest and largest value of each dimension
     :param n_neighbors: k
     :param weights: ``"inverse_quadratic"``, ``"gaussian"``, or a function of the squared distances
-    :param bandwidth: distance, in scaled units, over which the weights fall
+    :param bandwidth: distance, in scaled units, over which the weights decrease
     """
 
     def __init__(
@@ -113,14 +112,14 @@ class NearestPoints:
 
     def __call__(self, observation: ArrayLike) -> Neighbours:
         squared = squared_distances(scale(observation, *self.bounds), self.points)
-        # A stable sort: of equally distant points the lower index counts as nearer.
+        # A stable sort breaks ties in favour of the lower index.
         nearest = np.argsort(squared, kind="stable")[: self.n_neighbors]
         w = weigh(squared[nearest], self.weights, self.bandwidth)
         return Neighbours(nearest, w / w.sum())
 
 
 class ExactStates:
-    """Perceive a discrete observation exactly: each state is a point, and its own only neighbour."""
+    """Perceive a discrete observation exactly: each state is a point, which is its only neighbour."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
         self.sizes = tuple(int(n) for n in sizes)
@@ -144,7 +143,7 @@ def make_perceiver(space: spaces.Space[Any], **settings: Any) -> Perceiver:
 # --------------------------------------------------------------------------------------------------- 2. the agent
 #
 # Every point i holds a value Q(i, a) for each action a. The value of an action at an observation is the mean over the
-# neighbours, weighted by p. A TD error is credited to the entries that led to it, in proportion to their traces.
+# neighbours, weighted by p. A TD error updates all entries in proportion to their traces.
 
 
 @dataclass
@@ -152,8 +151,9 @@ class Transition:
     """
     One step of one environment.
 
-    :param next_state: the observation after the step; at the end of an episode its last one, not the next one's first
-    :param next_action: the action chosen there, which SARSA learns from; ``None`` for the greedy one
+    :param next_state: the observation after the step; at the end of an episode its last observation, not the first one
+        of the next episode
+    :param next_action: the action selected there, used by SARSA; ``None`` for the greedy action
     """
 
     state: Any
@@ -168,12 +168,12 @@ class Transition:
 @dataclass
 class Rates:
     """
-    What may change from one step to the next.
+    Parameters that may change from step to step.
 
     :param learning_rate: α
     :param trace_decay: λ
-    :param epsilon: probability of a random action, with ``exploration="epsilon_greedy"``
-    :param temperature: of the softmax, with ``exploration="softmax"``
+    :param epsilon: probability of a random action, for ``exploration="epsilon_greedy"``
+    :param temperature: temperature of the softmax, for ``exploration="softmax"``
     """
 
     learning_rate: float
@@ -184,11 +184,11 @@ class Rates:
 
 def shared_step(traces: Array, scaled_errors: Array) -> Array:
     """
-    The change of a table that several environments share.
+    The update of a table that several environments share.
 
-    Each entry moves by the mean of the environments' errors, weighted by their traces there, times the largest of
-    these traces: environments in one place agree on a step rather than adding theirs up. For one environment this is
-    eq. 14, α δ e.
+    The update of each entry is the mean of the environments' errors, weighted by their traces there, times the largest
+    of these traces: the updates of environments in the same place are averaged instead of added. For one environment
+    this is eq. 14, α δ e.
 
     :param traces: e of each environment, shape (n_envs, n_points, n_actions)
     :param scaled_errors: α δ of each environment, shape (n_envs,)
@@ -210,8 +210,8 @@ class KNNTDAgent:
     :param target: ``"sarsa"``, ``"q_learning"`` or ``"expected_sarsa"``
     :param traces: ``"replacing"`` or ``"accumulating"``
     :param reset_other_actions: whether replacing traces clear those of the actions that were not taken
-    :param step_size: ``"paper"`` for α, or ``"normalized"`` for α / Σp², by which the error at the state shrinks by the
-        share α whatever k
+    :param step_size: ``"paper"`` for α, or ``"normalized"`` for α / Σp², which removes the share α of the error at the
+        state for every k
     :param exploration: ``"epsilon_greedy"`` or ``"softmax"``
     """
 
@@ -244,16 +244,16 @@ class KNNTDAgent:
     def q_values(self, state: Any) -> Array:
         """Eq. 8: the value of every action, shape (n_actions,)."""
         indices, p = self.perceive(state)
-        # Not a matrix product: the sum of every action must be taken in the same order, or equal values would come out
-        # unequal and rounding would decide between them.
+        # Not a matrix product: the sums of all actions must have the same order, or rounding could make equal values
+        # unequal.
         return np.asarray((p[:, None] * self.q_table[indices]).sum(axis=0))
 
     def greedy_action(self, state: Any) -> int:
-        """Eq. 9: the best action; of several the first."""
+        """Eq. 9: the best action, the first in case of ties."""
         return int(np.argmax(self.q_values(state)))
 
     def action_probabilities(self, state: Any, rates: Rates) -> Array:
-        """The policy that explores: the probability of every action, shape (n_actions,)."""
+        """The probability of every action under the exploration policy, shape (n_actions,)."""
         q = self.q_values(state)
         if self.exploration == "epsilon_greedy":
             probabilities = np.full(len(q), rates.epsilon / len(q))
@@ -265,14 +265,14 @@ class KNNTDAgent:
         raise ValueError(self.exploration)
 
     def sample_action(self, state: Any, rates: Rates, rng: np.random.Generator) -> int:
-        """An action of the policy that explores."""
+        """A sample from the exploration policy."""
         probabilities = self.action_probabilities(state, rates)
         return int(rng.choice(len(probabilities), p=probabilities))
 
     # Learning
 
     def next_value(self, step: Transition, rates: Rates) -> float:
-        """The value of the state after the step. After a terminal state nothing follows; a time limit ends nothing."""
+        """The value of the state after the step: 0 after a terminal state; after a truncation the target bootstraps."""
         if step.terminated:
             return 0.0
         q = self.q_values(step.next_state)
@@ -290,7 +290,7 @@ class KNNTDAgent:
         return float(step.reward + self.gamma * self.next_value(step, rates) - expected)
 
     def set_traces(self, env: int, step: Transition) -> None:
-        """Eq. 15 or 16: the neighbours of the state become eligible, for the action that was taken."""
+        """Eq. 15 or 16: set the traces of the state's neighbours for the action taken."""
         indices, p = self.perceive(step.state)
         if self.trace_kind == "accumulating":
             self.traces[env, indices, step.action] += p
@@ -311,7 +311,7 @@ class KNNTDAgent:
 
     def learn(self, steps: Sequence[Transition], rates: Rates) -> None:
         """Lines 15 to 20: learn from one step of every environment."""
-        # All errors before any change: no environment sees what another has just learned.
+        # Compute all errors before the update: no environment uses values that another has just updated.
         errors = np.array([self.td_error(step, rates) for step in steps])
         alphas = np.array([self.alpha(step, rates) for step in steps])
         for env, step in enumerate(steps):
@@ -338,7 +338,7 @@ def train(env: gym.Env[Any, Any], agent: KNNTDAgent, rates: Rates, n_episodes: i
         total, terminated, truncated = 0.0, False, False
         while not (terminated or truncated):
             next_state, reward, terminated, truncated, _ = env.step(action)
-            # SARSA: the action that will be taken is chosen before the table changes.
+            # SARSA: select the next action before the table changes.
             next_action = agent.sample_action(next_state, rates, rng)
             step = Transition(state, action, float(reward), next_state, terminated, truncated, next_action)
             agent.learn([step], rates)
@@ -349,7 +349,7 @@ def train(env: gym.Env[Any, Any], agent: KNNTDAgent, rates: Rates, n_episodes: i
 
 
 def evaluate(env: gym.Env[Any, Any], act: Callable[[Any], Any], n_episodes: int) -> float:
-    """The mean return of ``act``, a function from observations to actions, without learning."""
+    """The mean return of ``act``, a function from observations to actions."""
     total = 0.0
     for _ in range(n_episodes):
         state, _ = env.reset()
@@ -370,9 +370,9 @@ def main() -> None:
     space, actions = env.observation_space, env.action_space
     assert isinstance(space, spaces.Box)
     assert isinstance(actions, spaces.Discrete)
-    # One spacing of the lattice as bandwidth: near neighbours count, far ones hardly do.
+    # A bandwidth of one lattice spacing, so that distant neighbours have small weights.
     perceive = NearestPoints((22, 22), (space.low, space.high), 10, weights="gaussian", bandwidth=2 / 21)
-    # No return is as high as -10, so every action gets tried. A start at 0 would do as well and take longer.
+    # Optimistic: all returns are below -10, so every action is tried. 0 works as well, but takes longer.
     agent = KNNTDAgent(perceive, int(actions.n), step_size="normalized", initial_value=-10.0)
     returns = train(env, agent, Rates(learning_rate=0.4, trace_decay=0.92), arguments.episodes, arguments.seed)
     for start in range(0, len(returns), 25):

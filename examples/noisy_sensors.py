@@ -1,11 +1,10 @@
 """
-Learn to drive a Mountain-Car whose sensors are noisy, with and without the δs filter, and draw what the filter makes of
-an episode.
+Train on Mountain-Car with noisy sensors, with and without the δs filter, and plot the filtered signal of one episode.
 
     python examples/noisy_sensors.py noisy_sensors.png
 
-The noise has a standard deviation of 3 % of the range of position and of velocity. The filter knows neither noise
-nor dynamics; it learns how the state changes while KNNTD learns what to do.
+The standard deviation of the noise is 3 % of the range of position and velocity. The filter knows neither the noise nor
+the dynamics; it learns how the state changes while KNNTD learns to act.
 """
 
 import sys
@@ -25,8 +24,8 @@ EPISODES = 50
 def noisy_cars(n_envs: int, seed: int) -> VecEnv:
     """
     :param n_envs: number of environments
-    :param seed: of their noise and starts
-    :return: noisy Mountain-Cars
+    :param seed: seed of their noise and initial states
+    :return: Mountain-Cars with noisy observations
     """
     return make_vec_env("sb3_knntd/MountainCar-v0", n_envs, seed=seed, env_kwargs={"start": "uniform", "noise": 0.03})
 
@@ -35,8 +34,8 @@ def drive(model: KNNTD, venv: VecEnv) -> tuple[list[int], np.ndarray]:
     """
     :param model: the trained model
     :param venv: one environment, filtered or not
-    :return: number of steps of each of some episodes, and of all their steps what the model was told, what the sensors
-        said, and the truth, shape (n_steps, 3, 2)
+    :return: the lengths of some episodes; and for all their steps the estimate, the sensor reading and the true state,
+        shape (n_steps, 3, 2)
     """
     lengths, rows = [0], []
     observation = venv.reset()
@@ -62,10 +61,10 @@ def main() -> None:
     filtered = KNNTD(venv, seed=0).learn(steps)
     lengths, rows = drive(filtered, venv.for_evaluation(noisy_cars(1, seed=1)))
     print(f"with filter: {np.mean(lengths):.0f} steps to the goal")
-    told, sensed, truth = rows.transpose(1, 0, 2)
-    remaining = np.sqrt(((told - truth) ** 2).mean(axis=0) / ((sensed - truth) ** 2).mean(axis=0))
+    estimated, sensed, truth = rows.transpose(1, 0, 2)
+    remaining = np.sqrt(((estimated - truth) ** 2).mean(axis=0) / ((sensed - truth) ** 2).mean(axis=0))
     shares = "{:.2f} of position, {:.2f} of velocity".format(*remaining)
-    print(f"error of the estimates over that of the sensors: {shares}")
+    print(f"error of the estimates relative to the sensors: {shares}")
 
     figure = new_figure(8.0, 5.0)
     first = slice(0, lengths[0] - 1)
@@ -74,7 +73,7 @@ def main() -> None:
         axes = panels[dimension]
         axes.plot(sensed[first, dimension], ".", color="0.65", label="sensors")
         axes.plot(truth[first, dimension], color=BASELINE_COLOR, linewidth=1.5, label="truth")
-        axes.plot(told[first, dimension], color=LINE_COLOR, linewidth=1.5, label="estimate")
+        axes.plot(estimated[first, dimension], color=LINE_COLOR, linewidth=1.5, label="estimate")
         axes.set_ylabel(name)
         axes.grid(color="0.92")
     panels[1].set_xlabel("step")

@@ -1,11 +1,11 @@
 """
-Level control of two tanks in a row, by a valve: an environment of one's own, continuous actions, and the step response
-of what was learned.
+Level control of two tanks with a valve: a custom environment, continuous actions, and the step response of the learned
+controller.
 
     python examples/tank_level.py tank_level.png
 
-The valve feeds the upper tank, which drains into the lower one, which drains away (Torricelli's law). The level of the
-lower tank is to follow a set point, which changes from episode to episode.
+The valve feeds the upper tank, which drains into the lower one, which drains away (Torricelli's law). The goal is to
+keep the level of the lower tank at a set point, which changes from episode to episode.
 """
 
 import math
@@ -32,8 +32,8 @@ LOWEST, HIGHEST = 0.05, 0.15  # set points, m
 
 class TankEnv(gym.Env):
     """
-    Observation: levels of the upper and the lower tank, and the set point, m. Action: how far the valve is open, from
-    0 to 1. Reward: less the distance of the lower level from the set point, cm, at each step.
+    Observation: the levels of the upper and the lower tank and the set point, m. Action: the valve opening, from 0 to
+    1. Reward: the negative distance of the lower level from the set point, cm.
     """
 
     def __init__(self):
@@ -62,12 +62,12 @@ class TankEnv(gym.Env):
         return np.array([self.upper, self.lower, self.set_point], np.float32)
 
 
-# A time limit cuts an episode off without ending it: learning goes on beyond it as if the tanks ran for ever.
+# A time limit truncates an episode. The target bootstraps there, as in a continuing task.
 gym.register("Tank-v0", entry_point=TankEnv, max_episode_steps=STEPS)
 
 
 class PI:
-    """The usual controller to compare with, its gains the best of a grid for the set points below."""
+    """The standard controller for comparison, with gains from a grid search for the set points below."""
 
     GAIN = 15.0  # openings per m
     INTEGRAL_SECONDS = 30.0
@@ -85,9 +85,9 @@ class PI:
 
 def respond(controller, set_points):
     """
-    :param controller: a model of Tank-v0, or whatever predicts as one
-    :param set_points: one for each stretch of 100 steps, m
-    :return: seconds, set point, level of the lower tank and opening of the valve at each step
+    :param controller: a model of Tank-v0, or another object with the same ``predict``
+    :param set_points: one for every 100 steps, m
+    :return: seconds, set point, level of the lower tank and valve opening at each step
     """
     env = TankEnv()
     observation, _ = env.reset(options={"levels": (0.0, 0.0), "set_point": set_points[0]})
@@ -102,7 +102,7 @@ def respond(controller, set_points):
 
 def main():
     path = Path(sys.argv[1] if len(sys.argv) > 1 else "tank_level.png")
-    # Rewards are negative: with values that begin at 0, what was never tried would look best wherever it is seldom.
+    # Rewards are negative. With initial values of 0, actions that were never tried would look best.
     settings = {"points": (16, 16, 8), "gamma": 0.9, "trace_decay": 0.7, "initial_value": -50.0}
     model = ExA(gym.make("Tank-v0"), seed=0, **settings)
     model.learn(40_000)

@@ -1,5 +1,5 @@
 """
-Train on Mountain-Car for some seconds and draw what was learned: how good each state is, and what to do there.
+Train on Mountain-Car for a few seconds, and plot the value and the greedy action of each state.
 
     python examples/value_function.py value_function.png
 """

@@ -260,8 +260,8 @@ def test_competition_counts_the_steps_of_each_episode(benchmarks: Any, monkeypat
     monkeypatch.setattr(competition, "EPISODES", 3)
     monkeypatch.setattr(competition, "MOST_STEPS", 50)
     # Nobody leaves the valley in so few steps.
-    for sight in competition.SIGHTS:
-        assert competition.learn(sight, 7) == [50, 50, 50]
+    for variant in competition.VARIANTS:
+        assert competition.learn(variant, 7) == [50, 50, 50]
 
 
 def test_competition_is_learned_with_the_stored_configuration(benchmarks: Any) -> None:

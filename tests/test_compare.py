@@ -316,14 +316,14 @@ def test_algorithms_fit_by_their_actions() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--algos", "dqnn"], "--algos: there is no algorithm 'dqnn', but a2c"),
-        (["--algos", "sac"], "--algos: sac takes the actions of none of MountainCar-v0"),
+        (["--algos", "dqnn"], "--algos: unknown algorithm 'dqnn'; known are a2c"),
+        (["--algos", "sac"], "--algos: sac supports the action space of none of MountainCar-v0"),
         (["--env", "MountainCar-v9"], "--env: 'MountainCar-v9' cannot be made"),
         (["--steps", "39"], "--steps must be at least --eval-points, 40; got 39"),
         (["--steps", "0"], "must be a whole number of at least 1; got '0'"),
         (["--conf", "knntd"], "--conf must be NAME=FILE; got 'knntd'"),
         (["--conf", "knntd=/no/such.yml"], "No such file or directory: '/no/such.yml'"),
-        (["--conf", "nobody=/no/such.yml"], "--conf: there is no algorithm 'nobody'"),
+        (["--conf", "nobody=/no/such.yml"], "--conf: unknown algorithm 'nobody'"),
         (["--threshold", "high"], "--threshold: could not convert string to float: 'high'"),
         (["--threshold", "inf"], "--threshold must be finite; got MountainCar-v0=inf"),
         (["--threshold", "CartPole-v1=3"], "--threshold: 'CartPole-v1' is not among MountainCar-v0"),
@@ -447,11 +447,11 @@ def test_the_reader_is_told_what_to_read_with_care() -> None:
     one = comparison(task(runs))
     long = {key: found._replace(tuned_steps=301) for key, found in one.configurations.items() if key[1] == "knntd"}
     (short,) = cautions(one._replace(configurations={**one.configurations, **long}))
-    assert short == "Some configurations were made for more than 300 steps: kNN-TD(λ) on CartPole-v1 for 301."
+    assert short == "Some configurations were tuned for more than 300 steps: kNN-TD(λ) on CartPole-v1 for 301."
     (few,) = cautions(comparison(task({**runs, "knntd": runs["knntd"][:4]})))
-    assert few.startswith("Fewer than 5 seeds: the intervals mean little")
+    assert few.startswith("Fewer than 5 seeds: the intervals are not reliable")
     (busy,) = cautions(comparison(task(runs, cpu_seconds=0.6)))
-    assert "no more than 0.40 of a core" in busy
+    assert "only 0.40 of a core" in busy
     for name, value, word in (("versions", {"python": "3.13"}, "versions"), ("machine", {"system": "x"}, "machines")):
         mixed = task(runs)
         mixed.runs["random"][0] = mixed.runs["random"][0]._replace(  # type: ignore[index]
@@ -465,7 +465,7 @@ def test_the_report_tells_of_costs_failures_and_configurations() -> None:
     runs = {"knntd": [[0.0, 90.0, 120.0]] * 5, "random": [[0.0, 0.0, 0.0]] * 5}
     told = comparison(task(runs), failures={"<run>": "why & how"}, notes=["DQN cannot."])
     page = make_report(told)["report.html"].decode()
-    for words in ("never", "5 of 5", "made for 299 steps", "Failed: &lt;run&gt;", "why &amp; how", "DQN cannot."):
+    for words in ("never", "5 of 5", "tuned for 299 steps", "Failed: &lt;run&gt;", "why &amp; how", "DQN cannot."):
         assert words in page
 
 

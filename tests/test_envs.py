@@ -643,7 +643,7 @@ def test_windows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rendering_without_a_mode_warns() -> None:
     env = make(CAR)
     env.reset()
-    with pytest.warns(UserWarning, match='sb3_knntd/MountainCar-v0 draws only .* "human" or "rgb_array"'):
+    with pytest.warns(UserWarning, match='MountainCar-v0 was made without a render_mode .* "human" or "rgb_array"'):
         assert env.render() is None
 
 

@@ -1,4 +1,4 @@
-"""The examples run as they are, and show what they say."""
+"""The examples run without changes and give the results that they describe."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Runs ``run(script, *arguments)`` in an empty folder, and returns what it prints."""
+    """A function ``run(script, *arguments)`` that runs an example in an empty folder and returns its output."""
 
     def run(name: str, *arguments: str) -> str:
-        # In this process, as importing torch anew takes longer than most of them.
+        # In this process: importing torch in a new one takes longer than most examples.
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [name, *arguments])
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")
@@ -43,7 +43,7 @@ def test_value_function(run: Callable[..., str], tmp_path: Path) -> None:
 def test_tank_level(run: Callable[..., str], tmp_path: Path) -> None:
     distances = dict(re.findall(r"(\w+): mean distance from the set point (\S+) cm", run("tank_level.py")))
     assert set(distances) == {"PI", "ExA"}
-    # At the set points' average, the valve as it is, it would be three centimetres.
+    # A constant level at the mean of the set points has a mean distance of three centimetres.
     assert float(distances["ExA"]) < 2.0
     assert (tmp_path / "tank_level.png").read_bytes().startswith(PNG)
 
@@ -52,7 +52,7 @@ def test_knn_td_from_scratch(run: Callable[..., str]) -> None:
     printed = run("knn_td_from_scratch.py")
     first, *_, last = re.findall(r"episodes .* mean return (\S+)\n", printed)
     (greedy,) = re.findall(r"greedy policy: mean return (\S+)", printed)
-    # An episode that does not reach the goal has 200 steps; the environment counts as solved at -110.
+    # Episodes that do not reach the goal have 200 steps. The environment's reward threshold is -110.
     assert float(first) < -190.0
     assert float(last) >= -110.0
     assert float(greedy) >= -110.0
@@ -60,7 +60,7 @@ def test_knn_td_from_scratch(run: Callable[..., str]) -> None:
 
 def test_exa_from_scratch(run: Callable[..., str]) -> None:
     (greedy,) = re.findall(r"greedy policy: mean return (\S+)", run("exa_from_scratch.py"))
-    # The environment counts as solved at 90.
+    # The environment's reward threshold is 90.
     assert float(greedy) >= 90.0
 
 
@@ -71,11 +71,11 @@ def test_delta_filter_from_scratch(run: Callable[..., str]) -> None:
 
 
 def test_cliff_walking(run: Callable[..., str]) -> None:
-    pattern = r"(\w+): greedy route of (\d+) steps, return while training (\S+)"
+    pattern = r"(\w+): greedy path of (\d+) steps, mean training return (\S+)"
     lines = re.findall(pattern, run("cliff_walking.py"))
     (sarsa, sarsa_steps, sarsa_return), (q_learning, q_steps, q_return) = lines
     assert (sarsa, q_learning) == ("sarsa", "q_learning")
-    # The shortest way, along the edge, has 13 steps.
+    # The shortest path, along the edge, has 13 steps.
     assert int(q_steps) == 13 < int(sarsa_steps) < 20
     assert float(sarsa_return) > float(q_return)
 

@@ -87,9 +87,9 @@ def test_figure_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert table[1000] == episode_lengths("knntd", {**load_settings("fig3")["paper"]["knntd"], "episodes": 46}, 1000)
 
     verdict, then = verdict_of(folder), steps[:, 43]
-    assert "the paper says 105" in verdict
+    assert "the paper reports 105" in verdict
     assert "over 2 seeds (1000 to 1001)" in verdict
-    assert f"median {np.median(then):g} [" in verdict
+    assert f"the median is {np.median(then):g} [" in verdict
     assert f"{(then <= 105).sum()} of 2 seeds take 105 or fewer" in verdict
     assert verdict.endswith(f"Median at most 105: {'yes' if np.median(then) <= 105 else 'no'}.")
 
@@ -151,7 +151,7 @@ def test_figure_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         middle = np.median(late)
         assert (
             f"{dimension.capitalize()}: median {interval(first)} in the first episode, {interval(late)} in the last 20 "
-            f"of 22. Noise is taken out (median below 1; so in {sum(left < 1 for left in late)} of 2 seeds): "
+            f"of 22. Noise is removed (median below 1; true for {sum(left < 1 for left in late)} of 2 seeds): "
             f"{'yes' if middle < 1 else 'no'}; half of it or more: {'yes' if middle <= 0.5 else 'no'}."
         ) in verdict
 
@@ -213,9 +213,9 @@ def test_figure_6(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
             there = any(full[:6])
             firsts.append(full.index(True) + 1 if there else math.inf)
             shares.append(np.mean(full[full.index(True) + 1 :][:30]) if there else 0.0)
-        (told,) = re.findall(rf"{re.escape(name)}: (.*?follow: (?:yes|no)\.)", verdict)
+        (told,) = re.findall(rf"{re.escape(name)}: (.*?next episodes: (?:yes|no)\.)", verdict)
         assert told.startswith(f"the paper needs {claim}; here the median is {interval(firsts)}")
-        assert f"{firsts.count(math.inf)} of 2 seeds never get there" in told
+        assert f"{firsts.count(math.inf)} of 2 seeds never succeed" in told
         assert f"{100 * np.mean(shares):.1f} % last 1000 steps" in told
         assert f"Median at most {claim}: {'yes' if quantile(firsts, 0.5) <= claim else 'no'};" in told
 
@@ -257,7 +257,7 @@ def test_figure_7(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for algorithm, name in (("knntd", "kNN-TD(λ)"), ("exa", "Ex⟨a⟩(λ)")):
         changes = [float(row["mean_change"]) for (of, _), row in table.items() if of == algorithm and row["episode"]]
         median = f"median {interval(changes)}" if changes else "none"
-        assert f"{name}: {median}, of the {recorded[algorithm]} of 2 seeds that get there" in verdict
+        assert f"{name}: {median}, over the {recorded[algorithm]} of 2 seeds with such an episode" in verdict
 
 
 @pytest.mark.parametrize("figure", FIGURES)
@@ -405,7 +405,7 @@ def test_a_failed_seed_is_told_and_leaves_no_verdict(
     assert main(["reproduce", "fig3", "--seeds", "1", "--out", str(tmp_path)]) == 1
     error = capsys.readouterr().err
     assert "gamma must be" in error
-    assert "1 of 1 failed" in error
+    assert "1 of 1 runs failed" in error
     assert [path.name for path in (tmp_path / "fig3" / "paper").iterdir()] == ["seeds"]
 
 

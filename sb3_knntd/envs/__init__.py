@@ -1,6 +1,6 @@
 """
-The paper's environments. Importing this module registers them with gymnasium; where nothing imports it, as in the
-processes of a SubprocVecEnv, ``gymnasium.make("sb3_knntd.envs:sb3_knntd/MountainCar-v0")`` does.
+The paper's environments. Importing this module registers them with gymnasium. If nothing imports it, as in the
+processes of a SubprocVecEnv, use ``gymnasium.make("sb3_knntd.envs:sb3_knntd/MountainCar-v0")``.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from sb3_knntd.envs.mountain_car import MountainCarEnv
 
 __all__ = ["AcrobotEnv", "CartPoleEnv", "ContinuousCartPoleEnv", "GeneralizedMountainCarEnv", "MountainCarEnv"]
 
-# Id, class, limit of steps, and the mean return that counts as solved: gymnasium's own where there is such a problem,
-# four fifths of the highest return for the cart-pole's shaped reward, the competition's 150 steps for its Mountain-Car.
+# Id, class, step limit, and reward threshold: that of gymnasium's version if there is one, 80 % of the maximum return
+# for the cart-pole's shaped reward, and the competition's 150 steps for its Mountain-Car.
 for _id, _entry_point, _steps, _solved in (
     ("sb3_knntd/MountainCar-v0", "sb3_knntd.envs.mountain_car:MountainCarEnv", 1000, -110.0),
     ("sb3_knntd/CartPole-v0", "sb3_knntd.envs.cart_pole:CartPoleEnv", 1000, 8000.0),
@@ -28,6 +28,6 @@ for _id, _entry_point, _steps, _solved in (
         -150.0,
     ),
 ):
-    # A module that is loaded again would only make gymnasium warn.
+    # gymnasium warns about registering an id twice, for example when the module is reloaded.
     if _id not in gym.registry:
         gym.register(_id, entry_point=_entry_point, max_episode_steps=_steps, reward_threshold=_solved)

@@ -1,4 +1,4 @@
-"""The Acrobot: a double pendulum with a motor at the elbow only, to be swung above its support."""
+"""Acrobot: swing up a double pendulum with a motor only at the elbow."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_ROTATION_2 = 9.0 * math.pi
 GOAL_HEIGHT = 1.0
 
 FULL_TURN = 2.0 * math.pi
-#: Classical Runge-Kutta: each slope's weight, and how far along it the next one is taken.
+#: Classical Runge-Kutta: for each stage its weight, and the fraction of a step to the next stage.
 STAGES = ((1.0, 0.5), (2.0, 0.5), (2.0, 1.0), (1.0, 0.0))
 
 
@@ -37,12 +37,12 @@ def acrobot_step(
 
     The equations are those of Sutton and Barto, "Reinforcement Learning", or with ``nips`` those printed in Sutton,
     "Generalization in reinforcement learning: successful examples using sparse coarse coding" (1996), which lack
-    a term. Numba compiles it as it stands.
+    a term. The function can be compiled by numba.
 
-    :param state: angle of the first link from hanging and of the second from the first, rad in [-π, π], and their
-        angular velocities, rad/s in [-4π, 4π] and [-9π, 9π]
+    :param state: angle of the first link from the downward vertical and of the second link relative to the first, rad
+        in [-π, π], and their angular velocities, rad/s in [-4π, 4π] and [-9π, 9π]
     :param action: 0, 1 or 2 for a torque of -1, 0 or 1 N m at the elbow
-    :param nips: whether to take the equations of 1996
+    :param nips: whether to use the equations of 1996
     :return: the state after the step
     """
     torque = action - 1.0
@@ -72,7 +72,7 @@ def acrobot_step(
         total_3 += weight * turn_1
         total_4 += weight * turn_2
         span = reach * TIME_STEP
-        # Angles first: their slope is the rotation from before this stage's move.
+        # Update the angles first: their slope is the angular velocity before this stage changes it.
         angle_1, angle_2 = state[0] + span * rotation_1, state[1] + span * rotation_2
         rotation_1, rotation_2 = state[2] + span * turn_1, state[3] + span * turn_2
 
@@ -100,11 +100,11 @@ class AcrobotEnv(PaperEnv["int | np.integer[Any]"]):
     """
     ## Description
 
-    Two links hang from a support. A motor at the joint between them, too weak to lift them outright, has to swing the
-    free end above a line one link's length over the support.
+    Two links hang from a support. The motor at the joint between them is too weak to lift them directly. It must swing
+    the free end above a line one link length above the support.
 
-    `gymnasium`'s `Acrobot-v1` has the same dynamics and observes sines and cosines, six numbers for four; here the
-    state itself is observed, which a table over a grid needs to be small.
+    `gymnasium`'s `Acrobot-v1` has the same dynamics, but its observations contain sines and cosines, six numbers
+    instead of four. Here the observation is the state itself, which keeps a table over a grid small.
 
     ## Action Space
 
@@ -130,8 +130,8 @@ class AcrobotEnv(PaperEnv["int | np.integer[Any]"]):
     ## Dynamics
 
     Links of 1 m and 1 kg, centres of mass in their middles, moments of inertia 1 kg m², gravity 9.8 m/s², one
-    Runge-Kutta step of fourth order every 0.2 s. `dynamics="book"` takes the equations of Sutton and Barto's book,
-    `"nips"` those of the paper of 1996, which lack a term.
+    fourth-order Runge-Kutta step of 0.2 s. `dynamics="book"` uses the equations of Sutton and Barto's book, `"nips"`
+    those of the paper of 1996, which lack a term.
 
     ## Rewards
 
@@ -160,13 +160,13 @@ class AcrobotEnv(PaperEnv["int | np.integer[Any]"]):
     | Parameter     | Type                | Default   | Description                                                    |
     |---------------|---------------------|-----------|----------------------------------------------------------------|
     | `dynamics`    | str                 | `"book"`  | `"book"` or `"nips"`                                           |
-    | `start`       | str or 4 numbers    | `"fixed"` | where episodes start                                           |
-    | `reward`      | str                 | `"step"`  | what is rewarded                                               |
-    | `noise`       | number or 4 numbers | `0.0`     | of the observations: standard deviation / (Max - Min)          |
+    | `start`       | str or 4 numbers    | `"fixed"` | initial state of the episodes                                  |
+    | `reward`      | str                 | `"step"`  | reward function                                                |
+    | `noise`       | number or 4 numbers | `0.0`     | observation noise: standard deviation / (Max - Min)            |
     | `render_mode` | str                 | `None`    | `"human"` or `"rgb_array"`                                     |
 
     `reset` takes `options={"state": (θ1, θ2, dθ1, dθ2)}`, or `{"low": ..., "high": ...}` for limits of all four. With
-    noise, `info["state"]` holds the state without it.
+    noise, `info["state"]` is the true state.
 
     ```python
     >>> import gymnasium as gym
@@ -211,7 +211,7 @@ class AcrobotEnv(PaperEnv["int | np.integer[Any]"]):
         """
         :param action: 0, 1 or 2
         :return: observation, reward, terminated, truncated (never), info
-        :raises ValueError: if the action is another
+        :raises ValueError: if the action is invalid
         """
         angle_1, angle_2, rotation_1, rotation_2 = self._known_state()
         if not self.action_space.contains(action):
@@ -242,7 +242,7 @@ class AcrobotEnv(PaperEnv["int | np.integer[Any]"]):
         canvas.fill(SKY)
         for dash in np.arange(-2.25, 2.2, 0.15).tolist():
             canvas.bar((dash, GOAL_HEIGHT), (dash + 0.08, GOAL_HEIGHT), 0.025, GREEN, rounded=False)
-        # Angles count from hanging, counter-clockwise.
+        # Angles are counter-clockwise from the downward vertical.
         elbow = turned([(0.0, -LINK_LENGTH)], state[0])[0]
         tip = turned([(0.0, -LINK_LENGTH)], state[0] + state[1], elbow)[0]
         canvas.polygon([(-0.3, 0.0), (0.3, 0.0), (0.3, 0.05), (-0.3, 0.05)], STEEL)

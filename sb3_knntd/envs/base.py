@@ -1,4 +1,4 @@
-"""What the environments share: where an episode starts, what is observed of the state, and pictures."""
+"""The common base class of the environments: initial states, observations, noise and rendering."""
 
 from __future__ import annotations
 
@@ -21,26 +21,25 @@ State = tuple[float, ...]
 
 class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC):
     """
-    An environment whose state is a tuple of floats and whose observation is that state, with noise if asked for.
+    An environment whose state is a tuple of floats and whose observation is that state, optionally with noise.
 
-    Noise is Gaussian, drawn anew for each observation from the environment's own generator. It touches what is
-    observed and nothing else: the state, the reward and the end of an episode are exact, and ``info["state"]``
-    tells the state, as a float64 array, whenever there is noise. An observation beyond the observation space is
-    reported at the space's limit.
+    The noise is Gaussian and drawn independently for each observation from the environment's own generator. It affects
+    only the observations: the state, the reward and the end of an episode are exact. With noise, ``info["state"]`` is
+    the true state as a float64 array. Observations are clipped to the observation space.
 
     :param observation_space: a Box of shape (state_dim,)
-    :param ranges: width of each dimension's usual range, shape (state_dim,), state units: the unit of ``noise``
-    :param starts: for each word that ``start`` may be, "uniform" among them, the limits (low, high) of uniform draws,
-        each a state
-    :param start: one of these words, or a state
-    :param noise: standard deviation of the noise as a share of ``ranges``, a number or one number a dimension
+    :param ranges: width of each dimension's usual range, shape (state_dim,), state units; the unit of ``noise``
+    :param starts: the named distributions of initial states, including "uniform": for each name the limits (low, high)
+        of a uniform distribution, two states
+    :param start: one of these names, or a state
+    :param noise: standard deviation of the noise as a share of ``ranges``, a number or one number per dimension
     :param render_mode: None, "human" or "rgb_array"
     :param state_space: a Box of the states, shape (state_dim,); None if it is the observation space
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
 
-    #: What ``options={"low": ..., "high": ...}`` of :meth:`reset` apply to; the other dimensions start as usual.
+    #: The dimensions that ``options={"low": ..., "high": ...}`` of :meth:`reset` apply to.
     drawn_dimensions: ClassVar[slice] = slice(None)
 
     def __init__(
@@ -81,11 +80,11 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
         """
         Start an episode.
 
-        :param seed: of the environment's generator; None leaves it as it is
-        :param options: ``{"state": state}`` starts there; ``{"low": number, "high": number}`` starts as "uniform" does,
-            between these; both only for this episode
+        :param seed: seed of the environment's generator; None leaves it unchanged
+        :param options: ``{"state": state}`` sets the initial state; ``{"low": number, "high": number}`` sets the limits
+            of the "uniform" distribution; both only for this episode
         :return: observation and info
-        :raises ValueError: if an option is no state of the environment
+        :raises ValueError: if an option does not give a state of the environment
         """
         super().reset(seed=seed)
         self.state = self._draw_start(options or {})
@@ -120,7 +119,7 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
         except (TypeError, ValueError):
             state = np.empty(0)
         low, high = self._state_space.low, self._state_space.high
-        # In the space's own precision, or its limits would not always be in it.
+        # Compare in the precision of the space, so that its limits are valid states.
         with np.errstate(over="ignore"):
             rounded = state.astype(np.float32)
         if state.shape != low.shape or not ((rounded >= low) & (rounded <= high)).all():
@@ -136,7 +135,7 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
         return self.state
 
     def _on_reset(self) -> None:
-        """Forget what belongs to the episode before."""
+        """Reset attributes that belong to the previous episode."""
 
     def _observe(self) -> npt.NDArray[np.float32]:
         observed = np.array(self.state, dtype=np.float64)
@@ -146,8 +145,8 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
 
     def _fold(self, observed: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """
-        :param observed: state and noise
-        :return: the same with angles that go full circle brought back to theirs
+        :param observed: state plus noise
+        :return: the same with angles wrapped to [-π, π]
         """
         return observed
 
@@ -162,13 +161,13 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """
-        Draw the state.
+        Render the state.
 
-        :return: with "rgb_array" the picture, shape (height, width, 3); else None
+        :return: with "rgb_array" the image, shape (height, width, 3); else None
         """
         if self.render_mode is None:
             name = self.spec.id if self.spec is not None else type(self).__name__
-            logger.warn(f'{name} draws only if it was made with a render_mode: "human" or "rgb_array"')
+            logger.warn(f'{name} was made without a render_mode and cannot render; pass "human" or "rgb_array"')
             return None
         if self.state is None:
             raise ResetNeeded("call reset() before render()")
@@ -193,6 +192,6 @@ def _check_noise(noise: Any, n_dimensions: int) -> npt.NDArray[np.float64]:
     if isinstance(noise, (bool, str)) or not fits:
         raise ValueError(
             f"noise must be a finite number >= 0, a share of each dimension's range, or {n_dimensions} such numbers, "
-            f"one a dimension; got {noise!r}"
+            f"one per dimension; got {noise!r}"
         )
     return np.broadcast_to(shares, (n_dimensions,)).copy()

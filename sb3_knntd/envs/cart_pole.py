@@ -1,4 +1,4 @@
-"""The cart-pole: a pole to be kept upright by the cart it stands on, with eleven forces or a continuous one."""
+"""Cart-pole: balance a pole on a cart, with eleven discrete forces or a continuous force."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ HALF_LENGTH = 0.5
 MAX_FORCE = 10.0
 TIME_STEP = 0.02
 
-#: Velocities have no limit; the largest float32 says so to those that do not take infinity.
+#: Velocities are unbounded. As in gymnasium, their limit is the largest float32 instead of infinity.
 UNLIMITED = float(np.finfo(np.float32).max)
-#: Usual velocities of cart (m/s) and pole (rad/s): what noise is a share of.
+#: Usual velocities of cart (m/s) and pole (rad/s); the noise is a share of them.
 USUAL_SPEED = 3.0
 USUAL_ROTATION = math.radians(60.0)
 
@@ -34,10 +34,10 @@ def cart_pole_step(state: tuple[float, float, float, float], push: float) -> tup
     One Euler step of 0.02 s of the standard cart-pole (Barto, Sutton and Anderson, "Neuronlike adaptive elements
     that can solve difficult learning control problems", 1983), without friction.
 
-    Numba compiles it as it stands.
+    The function can be compiled by numba.
 
     :param state: position (m), velocity (m/s), the pole's angle from upright (rad) and angular velocity (rad/s)
-    :param push: share of the largest force of 10 N, in [-1, 1]; positive pushes to the right
+    :param push: force as a share of 10 N, in [-1, 1]; positive is to the right
     :return: the state after the step
     """
     position, velocity, angle, rotation = state[0], state[1], state[2], state[3]
@@ -58,8 +58,8 @@ def cart_pole_step(state: tuple[float, float, float, float], push: float) -> tup
 def cart_pole_failed(state: tuple[float, float, float, float], track: float, failure_angle: float) -> bool:
     """
     :param state: as in :func:`cart_pole_step`
-    :param track: how far the cart may be from the middle, m
-    :param failure_angle: how far the pole may lean, rad
+    :param track: largest distance of the cart from the centre, m
+    :param failure_angle: largest angle of the pole, rad
     :return: whether the cart is off the track or the pole has fallen
     """
     return abs(state[0]) > track or abs(state[2]) > failure_angle
@@ -67,11 +67,12 @@ def cart_pole_failed(state: tuple[float, float, float, float], track: float, fai
 
 def cart_pole_shaped_reward(state: tuple[float, float, float, float], failed: bool) -> float:
     """
-    The reward that goes with the paper's experiment: upright, central and at rest is best, and failure costs 10,000.
+    The reward of the paper's experiment: highest if the pole is upright and at rest and the cart is in the centre.
+    Failure costs 10,000.
 
     :param state: as in :func:`cart_pole_step`, after the step
-    :param failed: whether it is a failure
-    :return: at most 10
+    :param failed: whether the step failed
+    :return: reward, at most 10
     """
     position, angle, rotation = abs(state[0]), abs(state[2]), abs(state[3])
     if failed:
@@ -111,14 +112,14 @@ class _CartPoleEnv(PaperEnv[ActionT]):
     @abstractmethod
     def _push_of(self, action: ActionT) -> float:
         """
-        :param action: as the agent gave it
+        :param action: action of the agent
         :return: share of the largest force, in [-1, 1]
-        :raises ValueError: if there is no such action
+        :raises ValueError: if the action is invalid
         """
 
     def step(self, action: ActionT) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """
-        :param action: which force to push the cart with
+        :param action: the force on the cart, as described for the action space
         :return: observation, reward, terminated, truncated (never), info
         :raises ValueError: if the action is not in the action space
         """
@@ -140,7 +141,7 @@ class _CartPoleEnv(PaperEnv[ActionT]):
         self._push = 0.0
 
     def _make_canvas(self, human: bool) -> Canvas:
-        # The whole track is in view, and the whole pole, however short the track.
+        # Show the whole track and the whole pole, however short the track is.
         width, height = 800, 220
         scale = min(width / (2.0 * self.track + 1.4), height / 2.3)
         return Canvas(
@@ -165,7 +166,7 @@ class _CartPoleEnv(PaperEnv[ActionT]):
 
         pivot = (position, 0.3)
         for limit in (-self._largest_angle, self._largest_angle):
-            # Dashes, lest a limit be taken for a pole.
+            # Dashed, to distinguish the limits from the pole.
             for dash in np.arange(0.15, 1.05, 0.12).tolist():
                 inner, outer = turned([(0.0, dash), (0.0, dash + 0.05)], -limit, pivot)
                 canvas.bar(inner, outer, 0.014, STEEL, rounded=False)
@@ -184,12 +185,12 @@ class CartPoleEnv(_CartPoleEnv["int | np.integer[Any]"]):
     """
     ## Description
 
-    A pole stands on a cart, free to fall to the left and to the right. Pushing the cart keeps it upright. It is the
-    task of the paper's figure 6 for learners of discrete actions; `sb3_knntd/ContinuousCartPole-v0` is the same with
-    a continuous force.
+    A pole stands on a cart and can fall to the left or to the right. Pushing the cart keeps it upright. This is the
+    task of the paper's figure 6 with discrete actions; `sb3_knntd/ContinuousCartPole-v0` is the same task with a
+    continuous force.
 
     `gymnasium`'s `CartPole-v1` has the same dynamics with two forces (`n_forces=2`), a shorter track (`track=2.4`),
-    a reward of 1 a step (`reward="step"`) and 500 steps.
+    a reward of 1 per step (`reward="step"`) and a limit of 500 steps.
 
     ## Action Space
 
@@ -206,8 +207,8 @@ class CartPoleEnv(_CartPoleEnv["int | np.integer[Any]"]):
     | 2   | angle from upright      | -`failure_angle` | `failure_angle` | the same    | rad   |
     | 3   | angular velocity        | none             | none            | ±π/3        | rad/s |
 
-    "None" is the largest float32. A position or angle beyond its limit, as in the step that fails, is reported at
-    the limit.
+    "None" is the largest float32. A position or angle beyond its limit, as in the step that fails, is clipped to the
+    limit.
 
     ## Dynamics
 
@@ -223,14 +224,14 @@ class CartPoleEnv(_CartPoleEnv["int | np.integer[Any]"]):
     | `"failure"`          | 0                   | -1                  |
 
     where *upright* = 10 - 10 (10 |angle|)² - 5 |position| - 10 |angular velocity| and
-    *fallen* = -10000 - 50 |position| - 100 |angle|, both of the state after the step.
-    The `reward_threshold` is a mean return of 8000 with `"shaped"`, of at most 10,000.
+    *fallen* = -10000 - 50 |position| - 100 |angle|, both computed from the state after the step.
+    The `reward_threshold` is a mean return of 8000 with `"shaped"`; the maximum is 10,000.
 
     ## Starting State
 
     | `start`             | state                                      |
     |---------------------|--------------------------------------------|
-    | `"fixed"` (default) | at rest but for a rotation of 0.01 rad/s   |
+    | `"fixed"` (default) | (0, 0, 0, 0.01), a slow rotation           |
     | `"uniform"`         | each of the four uniform in [-0.05, 0.05]  |
     | a state             | as given                                   |
 
@@ -244,15 +245,15 @@ class CartPoleEnv(_CartPoleEnv["int | np.integer[Any]"]):
     | Parameter       | Type                | Default    | Description                                             |
     |-----------------|---------------------|------------|---------------------------------------------------------|
     | `n_forces`      | int ≥ 2             | `11`       | number of forces (discrete version only)                |
-    | `start`         | str or 4 numbers    | `"fixed"`  | where episodes start                                    |
-    | `reward`        | str                 | `"shaped"` | what is rewarded                                        |
-    | `failure_angle` | number in (0, 90]   | `12.0`     | degrees from upright; 45 is the other usual one         |
-    | `track`         | number > 0          | `4.5`      | metres from the middle to either end                    |
-    | `noise`         | number or 4 numbers | `0.0`      | of the observations: standard deviation / usual width   |
+    | `start`         | str or 4 numbers    | `"fixed"`  | initial state of the episodes                           |
+    | `reward`        | str                 | `"shaped"` | reward function                                         |
+    | `failure_angle` | number in (0, 90]   | `12.0`     | degrees from upright; 45 is also common                 |
+    | `track`         | number > 0          | `4.5`      | metres from the centre to either end                    |
+    | `noise`         | number or 4 numbers | `0.0`      | observation noise: standard deviation / usual width     |
     | `render_mode`   | str                 | `None`     | `"human"` or `"rgb_array"`                              |
 
     `reset` takes `options={"state": (position, velocity, angle, angular velocity)}`, or `{"low": ..., "high": ...}`
-    for limits of all four. With noise, `info["state"]` holds the state without it.
+    for limits of all four. With noise, `info["state"]` is the true state.
 
     ```python
     >>> import gymnasium as gym
@@ -293,12 +294,11 @@ class ContinuousCartPoleEnv(_CartPoleEnv["npt.NDArray[np.floating[Any]]"]):
     ## Description
 
     `sb3_knntd/CartPole-v0` with a continuous force: the task of the paper's figures 6 and 7 for Ex⟨a⟩(λ). Dynamics,
-    observations, rewards, starts, ends and arguments are described there, except `n_forces`, which this one lacks.
+    observations, rewards, initial states, episode ends and arguments are the same, except that there is no `n_forces`.
 
     ## Action Space
 
-    `Box(-1, 1, (1,))`, float32: the force as a share of 10 N, positive to the right. What is beyond is taken for the
-    limit.
+    `Box(-1, 1, (1,))`, float32: the force as a share of 10 N, positive to the right. Larger values are clipped.
 
     | Num | Action | Min | Max |
     |-----|--------|-----|-----|
@@ -308,11 +308,11 @@ class ContinuousCartPoleEnv(_CartPoleEnv["npt.NDArray[np.floating[Any]]"]):
 
     | Parameter       | Type                | Default    | Description                                             |
     |-----------------|---------------------|------------|---------------------------------------------------------|
-    | `start`         | str or 4 numbers    | `"fixed"`  | where episodes start                                    |
-    | `reward`        | str                 | `"shaped"` | what is rewarded                                        |
-    | `failure_angle` | number in (0, 90]   | `12.0`     | degrees from upright; 45 is the other usual one         |
-    | `track`         | number > 0          | `4.5`      | metres from the middle to either end                    |
-    | `noise`         | number or 4 numbers | `0.0`      | of the observations: standard deviation / usual width   |
+    | `start`         | str or 4 numbers    | `"fixed"`  | initial state of the episodes                           |
+    | `reward`        | str                 | `"shaped"` | reward function                                         |
+    | `failure_angle` | number in (0, 90]   | `12.0`     | degrees from upright; 45 is also common                 |
+    | `track`         | number > 0          | `4.5`      | metres from the centre to either end                    |
+    | `noise`         | number or 4 numbers | `0.0`      | observation noise: standard deviation / usual width     |
     | `render_mode`   | str                 | `None`     | `"human"` or `"rgb_array"`                              |
 
     ```python

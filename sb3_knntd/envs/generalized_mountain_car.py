@@ -1,4 +1,4 @@
-"""The generalised Mountain-Car of the 2008 competition: displaced and noisy observations, and an engine that varies."""
+"""The generalised Mountain-Car of the 2008 competition: offset and noisy observations, and a variable engine force."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sb3_knntd.envs.mountain_car import (
 )
 from sb3_knntd.envs.rendering import Canvas
 
-#: Width of position and velocity, of which noise is a part.
+#: Ranges of position and velocity; the noise is a share of them.
 RANGES = (MAX_POSITION - MIN_POSITION, 2.0 * MAX_SPEED)
 
 MAX_OFFSET = 1.0
@@ -32,22 +32,22 @@ FORCE_DEVIATION = 0.05
 NOISE_SHAPE = (5.0, 2.0)
 
 START_POSITION = -0.5
-#: A third of the valley's positions, moved to the start.
+#: Initial positions: a third of the position range, around the fixed start.
 MIN_START, MAX_START = START_POSITION + MIN_POSITION / 3.0, START_POSITION + MAX_POSITION / 3.0
 
 _MAX_NOISE = tuple(0.5 * width / MIN_DIVIDER for width in RANGES)
 LOWEST_REPORT = (MIN_POSITION - MAX_OFFSET - _MAX_NOISE[0], -MAX_SPEED - MAX_OFFSET - _MAX_NOISE[1])
-#: The competition counted the highest velocity from the lowest, -0.07: what is above was reported as this.
+#: The competition computed the largest velocity from the smallest, -0.07; larger velocities are clipped to it.
 HIGHEST_REPORT = (MAX_POSITION + MAX_OFFSET + _MAX_NOISE[0], -MAX_SPEED + MAX_OFFSET + _MAX_NOISE[1])
 
 
 class MountainCarProblem(NamedTuple):
     """
-    What tells one problem of the generalised Mountain-Car from another.
+    The parameters of one problem of the generalised Mountain-Car.
 
-    :param offset: what is added to the position and the velocity that are reported, each in [-1, 1]
-    :param noise_divider: parts of the range of position and velocity that their noise spreads over, each in [5, 20]
-    :param force_factor: mean of what the engine's force is multiplied by, in [0.8, 1.2]
+    :param offset: offsets added to the observed position and velocity, each in [-1, 1]
+    :param noise_divider: range of position and velocity divided by the width of their noise, each in [5, 20]
+    :param force_factor: mean factor of the engine force, in [0.8, 1.2]
     """
 
     offset: tuple[float, float]
@@ -57,8 +57,8 @@ class MountainCarProblem(NamedTuple):
 
 def draw_problem(rng: np.random.Generator) -> MountainCarProblem:
     """
-    :param rng: generator to draw with
-    :return: a problem, each of its numbers uniform in its range
+    :param rng: random generator
+    :return: a problem, each parameter drawn uniformly from its range
     """
     low = (-MAX_OFFSET, -MAX_OFFSET, MIN_DIVIDER, MIN_DIVIDER, MIN_FORCE_FACTOR)
     high = (MAX_OFFSET, MAX_OFFSET, MAX_DIVIDER, MAX_DIVIDER, MAX_FORCE_FACTOR)
@@ -68,10 +68,10 @@ def draw_problem(rng: np.random.Generator) -> MountainCarProblem:
 
 def numbered_problem(number: int) -> MountainCarProblem:
     """
-    :param number: of the problem, an integer of at least 0
-    :return: the problem of that number, everywhere and always the same
+    :param number: number of the problem, an integer >= 0
+    :return: the problem with that number, always the same
     """
-    # A key of its own, or the problem would be made of the numbers that an environment with this seed starts with.
+    # The spawn key makes the problem independent of the random numbers of an environment with the same seed.
     return draw_problem(np.random.default_rng(np.random.SeedSequence(number, spawn_key=(0,))))
 
 
@@ -79,13 +79,13 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
     """
     ## Description
 
-    `sb3_knntd/MountainCar-v0` as it was made harder for the Second Annual Reinforcement Learning Competition of 2008,
-    where kNN-TD(λ) came second: the agent is told position and velocity with an unknown offset and with noise that has
-    a mean, and an engine that is stronger or weaker than usual varies from step to step. A *problem* is one draw of the
-    offsets, the noise's widths and the engine's mean strength; it stays what it is from episode to episode. It is also
-    the task of the paper's figure 4 for the δs filter, so `info["state"]` tells the true state at every step.
+    The harder version of `sb3_knntd/MountainCar-v0` of the Second Annual Reinforcement Learning Competition of 2008, in
+    which kNN-TD(λ) came second. Observed position and velocity have an unknown offset and noise with a nonzero mean.
+    The engine is stronger or weaker than usual, and its force varies from step to step. A *problem* is one draw of the
+    offsets, the widths of the noise and the mean engine force; it stays the same in all episodes. This is also the task
+    of the paper's figure 4 for the δs filter, so `info["state"]` is the true state at every step.
 
-    The competition gave an agent 100,000 steps on a problem, and its score was how many episodes it finished.
+    In the competition an agent had 100,000 steps per problem, and its score was the number of finished episodes.
 
     ## Action Space
 
@@ -103,35 +103,35 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
 
     | Num | Observation                  | Min    | Max   | Unit             |
     |-----|------------------------------|--------|-------|------------------|
-    | 0   | position + offset + noise    | -2.38  | 1.78  | of length        |
-    | 1   | velocity + offset + noise    | -1.084 | 0.944 | of length a step |
+    | 0   | position + offset + noise    | -2.38  | 1.78  | length           |
+    | 1   | velocity + offset + noise    | -1.084 | 0.944 | length per step  |
 
-    A problem's velocities fill a fourteenth of that range: learners that spread points over it waste most of them.
-    Velocities up to 1.084 come up, and are reported as 0.944: the competition's limit, though it was meant to be 1.084.
-    That touches about one problem in fifteen, those whose velocity offset is above 0.86, and where the offset is close
-    to 1 it hides nearly all of the velocity.
+    The velocities of one problem fill 1/14 of that range: a learner that spreads points over it wastes most of them.
+    Velocities can reach 1.084, but are clipped to 0.944, the limit of the competition, where 1.084 was intended. This
+    affects about one problem in fifteen, those with a velocity offset above 0.86. If the offset is close to 1, it hides
+    almost all of the velocity.
 
     ## Problems
 
-    | Number of a problem                        | Drawn uniformly from | Without it     |
+    | Parameter                                  | Drawn uniformly from | If disabled    |
     |--------------------------------------------|----------------------|----------------|
     | offset of the position                     | [-1, 1]              | 0              |
     | offset of the velocity                     | [-1, 1]              | 0              |
     | noise divider *d* of the position          | [5, 20]              | no noise       |
     | noise divider *d* of the velocity          | [5, 20]              | no noise       |
-    | mean *m* of the engine's strength          | [0.8, 1.2]           | strength 1     |
+    | mean factor *m* of the engine force        | [0.8, 1.2]           | factor 1       |
 
-    Noise is *(β - 0.5) range / d*, with *β* from Beta(5, 2) for every observation and dimension anew, and ranges of 1.8
-    and 0.14; so its mean is 0.214 *range / d*, its standard deviation 0.160 *range / d*.
+    The noise is *(β - 0.5) range / d*, with *β* drawn from Beta(5, 2) independently for every observation and
+    dimension, and ranges of 1.8 and 0.14. Its mean is 0.214 *range / d*, its standard deviation 0.160 *range / d*.
 
     ## Dynamics
 
-    Those of `sb3_knntd/MountainCar-v0`, except that each step's engine force is multiplied by a draw from *N(m, 0.05)*,
-    0.05 being the standard deviation. Gravity is exact.
+    Those of `sb3_knntd/MountainCar-v0`, except that the engine force of each step is multiplied by a sample of
+    *N(m, 0.05)*, where 0.05 is the standard deviation. Gravity does not vary.
 
     ## Rewards
 
-    -1 a step, and 0 for the step that reaches the goal, which `sb3_knntd/MountainCar-v0` rewards with -1 as well.
+    -1 per step, and 0 for the step that reaches the goal (-1 in `sb3_knntd/MountainCar-v0`).
     The `reward_threshold` is a mean return of -150.
 
     ## Starting State
@@ -144,30 +144,30 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
     ## Episode End
 
     1. Termination: true position ≥ 0.5.
-    2. Truncation, as registered: 1000 steps, as in `sb3_knntd/MountainCar-v0`. The competition had no limit but that of
-       all steps together; `gym.make(..., max_episode_steps=100_000)` comes to the same.
+    2. Truncation, as registered: 1000 steps, as in `sb3_knntd/MountainCar-v0`. The competition limited only the total
+       number of steps; `gym.make(..., max_episode_steps=100_000)` is equivalent.
 
     ## Arguments
 
     | Parameter      | Type                  | Default | Description                                                   |
     |----------------|-----------------------|---------|---------------------------------------------------------------|
-    | `problem`      | integer ≥ 0 or `None` | `0`     | which problem                                                 |
+    | `problem`      | integer ≥ 0 or `None` | `0`     | number of the problem                                         |
     | `noise`        | bool                  | `True`  | whether observations are noisy                                |
-    | `offset`       | bool                  | `True`  | whether observations are displaced                            |
-    | `random_force` | bool                  | `True`  | whether the engine has the problem's strength, and varies     |
-    | `random_start` | bool                  | `True`  | whether starts are drawn                                      |
+    | `offset`       | bool                  | `True`  | whether observations have an offset                           |
+    | `random_force` | bool                  | `True`  | whether the engine force has the problem's mean, and varies   |
+    | `random_start` | bool                  | `True`  | whether initial positions are random                          |
     | `render_mode`  | str                   | `None`  | `"human"` or `"rgb_array"`, both of the true state            |
 
-    A number stands for one problem, in every process and whatever the environment's seed: several environments, or one
-    to train in and one to evaluate in, are the same problem if they have the same number. With `None` the problem is
-    drawn when the environment is made, and drawn again, from that seed, by each `reset` that is given one; in between
-    it stays. `env.unwrapped.parameters` holds its numbers.
+    A number stands for the same problem in every process and for every seed: several environments, for example for
+    training and evaluation, are the same problem if they have the same number. With `None` a problem is drawn when the
+    environment is made, and a new one by each `reset` with a seed, from that seed. `env.unwrapped.parameters` holds the
+    parameters of the problem.
 
-    With a part switched off, the draws of the others stay as they are: the same seed and the same actions make the same
-    states with and without `noise` and `offset`.
+    Disabling one part does not change the random numbers of the others: the same seed and actions give the same states
+    with and without `noise` and `offset`.
 
-    `reset` takes `options={"state": (position, velocity)}`, the true ones, or `{"low": ..., "high": ...}` for limits of
-    the position.
+    `reset` takes `options={"state": (position, velocity)}` with the true values, or `{"low": ..., "high": ...}` for
+    limits of the position.
 
     ```python
     >>> import gymnasium as gym
@@ -178,10 +178,10 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
 
     ## Differences from the competition
 
-    The competition had 35 problems to practise on and others for the test, with numbers drawn from these ranges; they
-    are not among those drawn here. Its published source, `MountainCar.java` of the competition's software, gives the
-    noise the other sign and takes 5 and 2 for the degrees of freedom of two χ² variables, which makes *β* one of
-    Beta(2.5, 1): the same size of mean, and a standard deviation of 0.213 *range / d*.
+    The competition had 35 training problems and other test problems, with parameters drawn from these ranges; they are
+    not among the problems drawn here. Its published source, `MountainCar.java` of the competition's software, uses the
+    opposite sign of the noise, and 5 and 2 as the degrees of freedom of two χ² variables. *β* then has the distribution
+    Beta(2.5, 1): the mean has the same size, and the standard deviation is 0.213 *range / d*.
 
     ## Version History
 
@@ -226,10 +226,10 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
             ),
         )
         self.action_space = spaces.Discrete(3)
-        self.noise = noise  # type: ignore[assignment]  # A switch here, for noise of its own kind.
+        self.noise = noise  # type: ignore[assignment]  # A flag here: the noise of this task is not Gaussian.
         self.offset = offset
         self.random_force = random_force
-        #: The problem's numbers, whichever parts are switched on.
+        #: The parameters of the problem, including those of disabled parts.
         self.parameters = draw_problem(self.np_random) if self.problem is None else numbered_problem(self.problem)
         self._redraw = False
         self._push = 0
@@ -240,12 +240,12 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
         """
         Start an episode.
 
-        :param seed: of the environment's generator, from which with ``problem=None`` a problem is drawn; None leaves
-            both as they are
-        :param options: ``{"state": state}`` starts there; ``{"low": number, "high": number}`` starts between these
-            positions; both only for this episode
+        :param seed: seed of the environment's generator, from which with ``problem=None`` a problem is drawn; None
+            leaves both unchanged
+        :param options: ``{"state": state}`` sets the initial state; ``{"low": number, "high": number}`` the limits of
+            the initial position; both only for this episode
         :return: observation and info
-        :raises ValueError: if an option is no state of the environment
+        :raises ValueError: if an option does not give a state of the environment
         """
         self._redraw = self.problem is None and seed is not None
         return super().reset(seed=seed, options=options)
@@ -259,13 +259,13 @@ class GeneralizedMountainCarEnv(PaperEnv["int | np.integer[Any]"]):
         """
         :param action: 0, 1 or 2
         :return: observation, reward, terminated, truncated (never), info
-        :raises ValueError: if the action is another
+        :raises ValueError: if the action is invalid
         """
         state = self._known_state()
         if not self.action_space.contains(action):
             raise ValueError(f"action must be 0, 1 or 2; got {action!r}")
         self._push = int(action) - 1
-        # Drawn even if it is not used, so that the rest of the episode does not depend on what is switched on.
+        # Drawn even if it is not used, so that the other random numbers do not depend on which parts are enabled.
         factor = self.np_random.normal(self.parameters.force_factor, FORCE_DEVIATION)
         force = FORCE * factor if self.random_force else FORCE
         self.state = position, _ = mountain_car_step((state[0], state[1]), int(action), force)

@@ -1,4 +1,4 @@
-"""The Mountain-Car: an engine weaker than gravity, which has to gain height on the left to leave on the right."""
+"""Mountain-Car: drive up a hill with an engine that is weaker than gravity."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def mountain_car_step(state: tuple[float, float], action: int, force: float = FO
     """
     One step of the standard Mountain-Car (Sutton and Barto, "Reinforcement Learning", 2nd edition, example 10.1).
 
-    Numba compiles it as it stands.
+    The function can be compiled by numba.
 
-    :param state: position in [-1.2, 0.6] and velocity in [-0.07, 0.07], position units a step
-    :param action: 0, 1 or 2 for an engine pushing left, idle or pushing right
-    :param force: what a push adds to the velocity
+    :param state: position in [-1.2, 0.6] and velocity in [-0.07, 0.07], position units per step
+    :param action: 0, 1 or 2: push left, idle, push right
+    :param force: velocity that a push adds, position units per step
     :return: the state after the step
     """
     position, velocity = state[0], state[1]
@@ -46,11 +46,11 @@ class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
     """
     ## Description
 
-    A car stands in a valley. Its engine is weaker than gravity on the slopes, so the way up the hill on the right
-    leads through the one on the left. It is the task of the paper's figure 3, which claims 105 steps an episode
-    from episode 44 on; from the fixed start the shortest way takes 102.
+    A car starts in a valley. Its engine is weaker than gravity on the slopes, so it must first drive up the left hill
+    to gain enough speed for the right one. This is the task of the paper's figure 3, which claims 105 steps per episode
+    from episode 44 on. From the fixed start the shortest path takes 102 steps.
 
-    `gymnasium`'s `MountainCar-v0` has the same dynamics, starts elsewhere and ends after 200 steps.
+    `gymnasium`'s `MountainCar-v0` has the same dynamics, but other initial states and a limit of 200 steps.
 
     ## Action Space
 
@@ -68,13 +68,13 @@ class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
 
     | Num | Observation | Min   | Max  | Unit                 |
     |-----|-------------|-------|------|----------------------|
-    | 0   | position    | -1.2  | 0.6  | of length            |
-    | 1   | velocity    | -0.07 | 0.07 | of length a step     |
+    | 0   | position    | -1.2  | 0.6  | length               |
+    | 1   | velocity    | -0.07 | 0.07 | length per step      |
 
     ## Dynamics
 
-    *v ← v + 0.001 (action - 1) - 0.0025 cos(3 x)*, limited to [-0.07, 0.07]; then *x ← x + v*, limited to [-1.2, 0.6].
-    The wall at -1.2 takes all speed.
+    *v ← v + 0.001 (action - 1) - 0.0025 cos(3 x)*, clipped to [-0.07, 0.07]; then *x ← x + v*, clipped to [-1.2, 0.6].
+    At the wall at -1.2 the velocity becomes 0.
 
     ## Rewards
 
@@ -103,13 +103,13 @@ class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
 
     | Parameter     | Type                | Default   | Description                                                    |
     |---------------|---------------------|-----------|----------------------------------------------------------------|
-    | `start`       | str or 2 numbers    | `"fixed"` | where episodes start                                           |
-    | `reward`      | str                 | `"step"`  | what is rewarded                                               |
-    | `noise`       | number or 2 numbers | `0.0`     | of the observations: standard deviation / (Max - Min)          |
+    | `start`       | str or 2 numbers    | `"fixed"` | initial state of the episodes                                  |
+    | `reward`      | str                 | `"step"`  | reward function                                                |
+    | `noise`       | number or 2 numbers | `0.0`     | observation noise: standard deviation / (Max - Min)            |
     | `render_mode` | str                 | `None`    | `"human"` or `"rgb_array"`                                     |
 
     `reset` takes `options={"state": (position, velocity)}`, or `{"low": ..., "high": ...}` for limits of the
-    position. With noise, `info["state"]` holds the state without it.
+    position. With noise, `info["state"]` is the true state.
 
     ```python
     >>> import gymnasium as gym
@@ -158,7 +158,7 @@ class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
         """
         :param action: 0, 1 or 2
         :return: observation, reward, terminated, truncated (never), info
-        :raises ValueError: if the action is another
+        :raises ValueError: if the action is invalid
         """
         state = self._known_state()
         if not self.action_space.contains(action):
@@ -184,9 +184,9 @@ class MountainCarEnv(PaperEnv["int | np.integer[Any]"]):
 def mountain_car_canvas(human: bool, fps: int, caption: str) -> Canvas:
     """
     :param human: whether to open a window
-    :param fps: the most frames a second a window shows
+    :param fps: maximum frame rate of the window
     :param caption: title of the window
-    :return: a board with the whole valley in view, for :func:`draw_mountain_car`
+    :return: a canvas that shows the whole valley, for :func:`draw_mountain_car`
     """
     return Canvas((600, 400), (-0.32, 0.62), 600 / 2.1, human=human, fps=fps, caption=caption)
 
@@ -194,8 +194,8 @@ def mountain_car_canvas(human: bool, fps: int, caption: str) -> Canvas:
 def draw_mountain_car(canvas: Canvas, position: float, push: int) -> None:
     """
     :param canvas: from :func:`mountain_car_canvas`
-    :param position: of the car, in [-1.2, 0.6]
-    :param push: -1, 0 or 1 for an engine pushing left, idle or pushing right
+    :param position: position of the car, in [-1.2, 0.6]
+    :param push: -1, 0 or 1: push left, idle, push right
     """
     canvas.fill(SKY)
     places = np.linspace(-1.4, 0.8, 147).tolist()

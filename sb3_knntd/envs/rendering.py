@@ -1,4 +1,4 @@
-"""A small drawing board over pygame, in the units of the environment."""
+"""A small pygame canvas in world units."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ BLUE: Color = (43, 108, 176)
 ORANGE: Color = (226, 125, 38)
 GREEN: Color = (56, 142, 96)
 
-#: Everything is drawn this many times larger and scaled down: the one way to smooth edges that serves every shape.
+#: Shapes are drawn this many times larger and scaled down, which smooths the edges of all of them.
 OVERSAMPLING = 2
 
 
 def turned(points: Sequence[Point], angle: float, at: Point = (0.0, 0.0)) -> list[Point]:
     """
-    :param points: shape around the origin
+    :param points: corners of a shape around the origin
     :param angle: counter-clockwise, radians
-    :param at: where the origin is moved to
-    :return: the shape turned around the origin, then moved
+    :param at: new position of the origin
+    :return: the shape rotated around the origin, then translated
     """
     cos, sin = math.cos(angle), math.sin(angle)
     return [(at[0] + cos * x - sin * y, at[1] + sin * x + cos * y) for x, y in points]
@@ -41,11 +41,11 @@ class Canvas:
     """
     Draws shapes given in world units, x to the right and y upwards, into a window or an array.
 
-    :param size: width and height of the picture, pixels
-    :param center: world coordinates of the picture's middle
-    :param scale: pixels for one world unit
+    :param size: width and height of the image, pixels
+    :param center: world coordinates of the image centre
+    :param scale: pixels per world unit
     :param human: whether to open a window
-    :param fps: the most frames a second a window shows
+    :param fps: maximum frame rate of the window
     :param caption: title of the window
     :raises DependencyNotInstalled: if pygame is missing
     """
@@ -66,7 +66,7 @@ class Canvas:
         self._small = pygame.Surface(size, depth=32)
         self._window: pygame.Surface | None = None
         self._clock: pygame.time.Clock | None = None
-        # An array needs no display, so that pictures are taken on machines that have none.
+        # Only a window needs a display: arrays can be rendered on machines without one.
         if human:
             pygame.display.init()
             self._window = pygame.display.set_mode(size)
@@ -81,13 +81,13 @@ class Canvas:
         ]
 
     def fill(self, color: Color) -> None:
-        """:param color: of the whole picture"""
+        """:param color: colour of the whole image"""
         self._large.fill(color)
 
     def polygon(self, points: Sequence[Point], color: Color) -> None:
         """
         :param points: corners, world units
-        :param color: of the area
+        :param color: fill colour
         """
         self._pygame.draw.polygon(self._large, color, self._pixels(points))
 
@@ -95,7 +95,7 @@ class Canvas:
         """
         :param center: world units
         :param radius: world units
-        :param color: of the area
+        :param color: fill colour
         """
         self._pygame.draw.circle(self._large, color, self._pixels([center])[0], radius * self.scale)
 
@@ -104,7 +104,7 @@ class Canvas:
         :param start: world units
         :param end: world units
         :param width: world units
-        :param color: of the area
+        :param color: fill colour
         :param rounded: whether the ends are round
         """
         length = math.dist(start, end)
@@ -120,7 +120,7 @@ class Canvas:
         """
         :param points: world units
         :param width: world units
-        :param color: of the line
+        :param color: line colour
         """
         for start, end in itertools.pairwise(points):
             self.bar(start, end, width, color)
@@ -129,8 +129,8 @@ class Canvas:
         """
         :param start: world units
         :param end: world units
-        :param width: of the shaft, world units
-        :param color: of shaft and head
+        :param width: width of the shaft, world units
+        :param color: fill colour
         """
         length = math.dist(start, end)
         if length == 0.0:
@@ -145,7 +145,7 @@ class Canvas:
 
     def show(self) -> npt.NDArray[np.uint8] | None:
         """
-        :return: the picture, shape (height, width, 3), or None when it went to the window
+        :return: the image, shape (height, width, 3), or None if it is shown in the window
         """
         pygame = self._pygame
         pygame.transform.smoothscale(self._large, self.size, self._small)

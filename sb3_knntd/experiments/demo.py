@@ -1,4 +1,4 @@
-"""The demonstration: train, save, load, evaluate, draw."""
+"""``sb3-knntd demo``: train, save, load, evaluate, plot."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 EVAL_EPISODES = 100
 #: Predicting for several environments at once takes hardly longer than for one.
 EVAL_ENVS = 20
-#: Where an environment never cuts an episode, a policy that goes in circles would be evaluated for ever.
+#: Step limit for environments without one; otherwise the evaluation of a policy that moves in circles would not end.
 EVAL_STEP_LIMIT = 1000
-#: So that evaluation does not start where training did.
+#: Evaluation uses other initial states than training.
 EVAL_SEED_OFFSET = 1000
 
 
@@ -67,8 +67,8 @@ def _run(args: argparse.Namespace) -> int:
 
 class StopOnInterrupt:
     """
-    A callback for ``learn``, and the context it runs in: Ctrl-C ends training in good order after the step in
-    progress, so that the table is whole, and the progress bar gives the terminal back. A second Ctrl-C acts as usual.
+    A callback for ``learn``, and its context manager: Ctrl-C stops training after the current step, so that the table
+    is consistent and the progress bar is closed. A second Ctrl-C raises KeyboardInterrupt as usual.
     """
 
     def __init__(self) -> None:
@@ -91,26 +91,26 @@ class StopOnInterrupt:
 
 def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
     """
-    Train KNNTD, or ExA where actions are continuous, save it, load it, evaluate it beside a random policy, draw
-    pictures, and tell on standard output.
+    Train KNNTD, or ExA for continuous actions, save and load the model, compare it with a random policy, draw plots,
+    and print the results.
 
     :param env_id: gymnasium id
     :param steps: number of environment steps to train for
     :param seed: seed of training; evaluation derives its own from it
-    :param out: folder that all files are written to
-    :return: whether it came to its end; after Ctrl-C during training the model is saved, and no more
-    :raises CommandError: if there is no such environment, neither algorithm takes its spaces, or ``out`` is no
-        folder that can be written to
+    :param out: output folder
+    :return: True if everything was done; False after Ctrl-C during training, when only the model is saved
+    :raises CommandError: if there is no such environment, neither algorithm supports its spaces, or ``out`` cannot be
+        written to
     """
     env = make_env(env_id)
     algorithm = for_actions(env.action_space).load()
     name = algorithm.__name__
     try:
-        # Before the first file is written: an environment that is refused must not cost an earlier demo's files.
+        # Check the environment before any file of an earlier demo is overwritten.
         algorithm(env)
     except ValueError as error:
         raise CommandError(str(error)) from error
-    # Named after the environment, so that demos of several can share a folder.
+    # File names contain the environment, so that demos of several environments can share a folder.
     stem = f"{name.lower()}_{re.sub(r'[^A-Za-z0-9._-]', '_', env_id)}"
     files = {"model": out / f"{stem}.zip", "episodes": out / f"{stem}.monitor.csv"}
     try:
@@ -129,7 +129,7 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
     monitored.close()
     files["TensorBoard log"] = Path(model.logger.get_dir() or out)
     if stop.interrupted:
-        print(f"Interrupted after {model.num_timesteps:,} of {steps:,} steps. What was learned until then is saved.")
+        print(f"Interrupted after {model.num_timesteps:,} of {steps:,} steps. The model was saved.")
         _print_files(files)
         return False
     print(f"Trained in {seconds:.1f} s. Evaluating the saved model over {EVAL_EPISODES} episodes.")
@@ -149,7 +149,7 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
     print()
     _print_returns(f"Return on {env_id}", {name: learned, "random policy": random})
     if step_limit is not None:
-        print(f"The environment sets no limit to an episode: these were cut at {step_limit:,} steps.")
+        print(f"The environment has no step limit: evaluation episodes were cut at {step_limit:,} steps.")
 
     files["learning curve"] = out / f"{stem}_learning_curve.png"
     axes = plot_learning_curve(

@@ -1,4 +1,4 @@
-"""RL Zoo's own commands, with ``knntd`` and ``exa`` beside its algorithms (extra ``[zoo]``)."""
+"""RL Zoo's commands with ``knntd`` and ``exa`` added to its algorithms (extra ``[zoo]``)."""
 
 from __future__ import annotations
 

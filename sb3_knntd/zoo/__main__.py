@@ -1,4 +1,4 @@
-"""``python -m sb3_knntd.zoo train`` and so on."""
+"""Entry point of ``python -m sb3_knntd.zoo train`` and the other commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sampler whose first trial is what the configuration has."""
+"""A sampler whose first trial is the configuration."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from optuna.trial import FrozenTrial, TrialState
 
 class ConfigurationFirst(BaseSampler):
     """
-    Any sampler, but the first trial of a study takes the values that are there already, so that what the study finds
-    can be seen beside them, and no study ends worse than it began.
+    Wraps a sampler: the first trial of a study uses given values, so that the other trials can be compared with them
+    and the best trial is never worse.
 
-    :param sampler: for the other trials, and for values that are not there
-    :param values: of the first trial, by name; numbers beyond what is searched are moved to its limit, words that are
-        not searched are left to the sampler
+    :param sampler: sampler of the other trials, and of values that are not given
+    :param values: values of the first trial by name; numbers outside the search range are clipped to it, and categories
+        that are not searched are left to the sampler
     """
 
     def __init__(self, sampler: BaseSampler, values: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""RL Zoo's experiment, with what it does differently for this package's algorithms."""
+"""RL Zoo's experiment manager, adapted to this package's algorithms."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from sb3_knntd.zoo.configuration_first import ConfigurationFirst
 from sb3_knntd.zoo.schedules import with_schedules
 from sb3_knntd.zoo.search_space import attributes, study_values
 
-#: What a table and its traces are made for. As with a network's architecture, training goes on with what the saved
-#: model has.
+#: Arguments that determine the shape of the table. As with a network's architecture, those of the saved model apply
+#: when training continues.
 SHAPE = ("points", "bounds", "n_neighbors", "action_points", "action_table")
 
-#: How often, and after how many seconds, a database is tried again.
+#: Number of retries if a database cannot be used, and seconds between them.
 DATABASE_RETRIES = 3
 DATABASE_PAUSE = 1.0
 
 
 class KNNExperimentManager(ExperimentManager):
     """
-    RL Zoo's experiment manager, which with an algorithm of this package
+    RL Zoo's experiment manager, which for the algorithms of this package
 
-    * takes its configuration from ``sb3_knntd.zoo_configs``,
-    * reads schedules of all its arguments (:mod:`sb3_knntd.zoo.schedules`),
-    * runs on the CPU, where the step is compiled, unless another device is named,
-    * goes on training (``-i``) with the points and neighbours that the saved model has,
-    * tries the configuration itself first in a study.
+    * takes the configuration from ``sb3_knntd.zoo_configs``,
+    * supports schedules for several arguments (:mod:`sb3_knntd.zoo.schedules`),
+    * uses the CPU, where the step is compiled, unless another device is given,
+    * continues training (``-i``) with the points and neighbours of the saved model,
+    * starts a study with the configuration itself.
 
-    With the algorithms of RL Zoo it is RL Zoo's.
+    For the algorithms of RL Zoo nothing changes.
 
     :param args: arguments of the command line, stored with the run
     :param algo: name of the algorithm
-    :param arguments: RL Zoo's further ones, by position
-    :param options: RL Zoo's further ones, by name
+    :param arguments: further positional arguments of RL Zoo's manager
+    :param options: further keyword arguments of RL Zoo's manager
     """
 
     def __init__(self, args: argparse.Namespace, algo: str, *arguments: Any, **options: Any) -> None:
@@ -55,14 +55,14 @@ class KNNExperimentManager(ExperimentManager):
                 options["device"] = "cpu"
         super().__init__(args, algo, *arguments, **options)
 
-    # RL Zoo's is a static method; which schedules there are depends on the algorithm.
+    # A static method in RL Zoo; here it depends on the algorithm.
     def _preprocess_schedules(self, hyperparams: dict[str, Any]) -> dict[str, Any]:  # type: ignore[override]
         return with_schedules(hyperparams) if self._own else super()._preprocess_schedules(hyperparams)
 
     def _preprocess_action_noise(
         self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
     ) -> dict[str, Any]:
-        # Here RL Zoo counts the actions for the search space.
+        # RL Zoo determines the number of actions for the search space here, so determine obs_dim here, too.
         if isinstance(env.observation_space, spaces.Box):
             self.obs_dim = env.observation_space.shape[0]
         return super()._preprocess_action_noise(hyperparams, saved_hyperparams, env)
@@ -72,8 +72,8 @@ class KNNExperimentManager(ExperimentManager):
             given = [name for name in SHAPE if name in (self.custom_hyperparams or {})]
             if given:
                 raise ValueError(
-                    f"{' and '.join(given)} cannot be given with -i: training goes on with what "
-                    f"{self.trained_agent} has. Train a new agent without -i"
+                    f"{' and '.join(given)} cannot be given with -i: training continues with the values of "
+                    f"{self.trained_agent}. Train a new agent without -i"
                 )
             hyperparams = {name: value for name, value in hyperparams.items() if name not in SHAPE}
         return super()._load_pretrained_agent(hyperparams, env)
@@ -85,7 +85,7 @@ class KNNExperimentManager(ExperimentManager):
         return ConfigurationFirst(sampler, study_values(self._own.load(), self._hyperparams))
 
     def hyperparameters_optimization(self) -> None:
-        """Search hyperparameters, alone or as one of several workers on a study."""
+        """Optimize hyperparameters, alone or as one of several workers of a study."""
         if self.storage is not None and not self.storage.endswith(".log"):
             make_tables(self.storage)
         super().hyperparameters_optimization()
@@ -94,7 +94,7 @@ class KNNExperimentManager(ExperimentManager):
         """
         :param trial: trial of a study
         :return: mean return of the last evaluation
-        :raises optuna.TrialPruned: if others were better so far, or action values diverge
+        :raises optuna.TrialPruned: if the pruner stops the trial, or the action values diverge
         """
         if not self._own:
             return super().objective(trial)
@@ -103,19 +103,19 @@ class KNNExperimentManager(ExperimentManager):
         try:
             return super().objective(trial)
         except FloatingPointError as error:
-            # As RL Zoo does with the errors that networks raise for it.
+            # RL Zoo does the same with the errors of networks.
             print(error)
             raise optuna.TrialPruned from error
 
 
 def make_tables(url: str) -> None:
     """
-    Make Optuna's tables in a database, if they are not there.
+    Create Optuna's tables in a database, if they do not exist.
 
-    Optuna takes no lock for it: when several workers start at once on an empty database, all but one fail, and find
-    the tables when they try again.
+    Optuna uses no lock for this: if several workers start at once on an empty database, all but one fail, and find the
+    tables when they retry.
 
-    :param url: the database, in SQLAlchemy's form
+    :param url: SQLAlchemy URL of the database
     :raises sqlalchemy.exc.DBAPIError: if the database cannot be used
     """
     for retries_left in reversed(range(DATABASE_RETRIES + 1)):

@@ -1,4 +1,4 @@
-"""Schedules as words, for files and command lines."""
+"""Schedules as strings, for files and command lines."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ SCHEDULED = ("learning_rate", "trace_decay", "temperature")
 def with_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
     """
     :param hyperparams: arguments of an algorithm
-    :return: a copy in which schedules are functions; numbers stay
-    :raises ValueError: if a word is no schedule
+    :return: a copy with schedules as functions; numbers are unchanged
+    :raises ValueError: if a string is not a schedule
     """
     return hyperparams | {
         name: parse_schedule(name, hyperparams[name]) for name in SCHEDULED if isinstance(hyperparams.get(name), str)

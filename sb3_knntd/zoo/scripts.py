@@ -1,4 +1,4 @@
-"""RL Zoo's scripts, run with this package's algorithms and environments known to them."""
+"""Run RL Zoo's scripts with this package's algorithms and environments."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class Script(NamedTuple):
     """
     One of RL Zoo's scripts.
 
-    :param module: where it is
-    :param function: what runs it; ``None`` if it can only be run as a module
-    :param help: what it does
-    :param needs: modules it imports that RL Zoo itself can do without
-    :param by_folder: whether it looks for runs by the names of their folders
+    :param module: name of its module
+    :param function: name of its main function; ``None`` if it can only be run as a module
+    :param help: help text of the command line
+    :param needs: modules that it imports and that are optional in RL Zoo
+    :param by_folder: whether it finds runs by the names of their folders
     """
 
     module: str
@@ -34,25 +34,25 @@ class Script(NamedTuple):
 PLOTS = ("seaborn", "rliable")
 
 
-#: Under the names they have in RL Zoo.
+#: RL Zoo's scripts by their names there.
 SCRIPTS = {
-    "train": Script("rl_zoo3.train", "train", "RL Zoo: train an agent, or search its hyperparameters"),
+    "train": Script("rl_zoo3.train", "train", "RL Zoo: train an agent, or optimize its hyperparameters"),
     "enjoy": Script("rl_zoo3.enjoy", "enjoy", "RL Zoo: watch a trained agent"),
-    "record_video": Script("rl_zoo3.record_video", None, "RL Zoo: film a trained agent", ("moviepy",)),
+    "record_video": Script("rl_zoo3.record_video", None, "RL Zoo: record a video of an agent", ("moviepy",)),
     "plot_train": Script("rl_zoo3.plots", "plot_train", "RL Zoo: plot returns during training", PLOTS, by_folder=True),
     "all_plots": Script("rl_zoo3.plots", "all_plots", "RL Zoo: compare evaluations", PLOTS, by_folder=True),
-    "plot_from_file": Script("rl_zoo3.plots", "plot_from_file", "RL Zoo: plot what all_plots has stored", PLOTS),
+    "plot_from_file": Script("rl_zoo3.plots", "plot_from_file", "RL Zoo: plot the results of all_plots", PLOTS),
 }
 
 
 def register() -> None:
     """
-    Make this package's own algorithms, their configurations and search spaces, and its environments known to RL Zoo in
+    Register this package's own algorithms, their configurations and search spaces, and its environments with RL Zoo in
     this process.
 
     :raises ModuleNotFoundError: if RL Zoo is not installed
     """
-    # RL Zoo takes seconds to import, and the command line shows its help without it.
+    # Import RL Zoo only when needed: it takes seconds, and the command line shows its help without it.
     import rl_zoo3.exp_manager
     import rl_zoo3.train
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -60,7 +60,7 @@ def register() -> None:
     import sb3_knntd.envs  # noqa: F401
     from sb3_knntd.zoo.experiment import KNNExperimentManager
 
-    # All of RL Zoo's modules share these tables.
+    # These dictionaries are shared by all modules of RL Zoo.
     for name, algorithm in with_role(Role.OWN).items():
         rl_zoo3.ALGOS[name] = algorithm.load()
         search_space = algorithm.load_search_space()
@@ -76,8 +76,8 @@ def run(name: str, arguments: Sequence[str]) -> None:
     :param name: one of :data:`SCRIPTS`
     :param arguments: its arguments, as on the command line
     :raises KeyError: if there is no such script
-    :raises ModuleNotFoundError: if RL Zoo, or what the script needs besides, is not installed
-    :raises SystemExit: with code 2 if the arguments do not fit, with 0 after ``--help``
+    :raises ModuleNotFoundError: if RL Zoo, or another module that the script needs, is not installed
+    :raises SystemExit: with code 2 for invalid arguments, with 0 after ``--help``
     """
     script = SCRIPTS[name]
     register()
@@ -95,7 +95,7 @@ def run(name: str, arguments: Sequence[str]) -> None:
 
 @contextmanager
 def _errors_in_one_line() -> Iterator[None]:
-    """RL Zoo's parsers report mistakes as this package's do, and also those in NAME:VALUE, which they evaluate."""
+    """Make RL Zoo's parsers report errors like this package's, including errors in evaluating NAME:VALUE."""
     from rl_zoo3.utils import StoreDict
 
     from sb3_knntd.common.command_line import Parser
@@ -106,7 +106,7 @@ def _errors_in_one_line() -> Iterator[None]:
         try:
             store(action, parser, namespace, values, *option)
         except Exception as error:
-            form = "NAME:VALUE, the value as Python has it (gamma:0.9, weights:\"'gaussian'\")"
+            form = "NAME:VALUE with a Python literal as value (gamma:0.9, weights:\"'gaussian'\")"
             raise argparse.ArgumentError(action, f"must be {form}; got {' '.join(values)}: {error}") from error
 
     argparse.ArgumentParser.error = Parser.error  # type: ignore[assignment,method-assign]
@@ -119,7 +119,7 @@ def _errors_in_one_line() -> Iterator[None]:
 
 
 def _folder_names(arguments: Sequence[str]) -> list[str]:
-    """Environments by the names of their folders, where RL Zoo puts a dash for the slash of an id."""
+    """Replace environment ids by the names of their folders, in which RL Zoo replaces the slash by a dash."""
     from gymnasium import registry
     from huggingface_sb3 import EnvironmentName
 

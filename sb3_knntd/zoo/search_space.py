@@ -1,11 +1,11 @@
 """
-What ``train --optimize`` searches: for each algorithm a sampler, and a converter from a study's values to arguments.
+The search space of ``train --optimize``: for each algorithm a sampler, and a converter from a study's values to
+arguments.
 
-A study holds plain numbers and words. Most are on a log scale: 1 - γ and 1 - λ rather than γ and λ, points in a
-dimension, and the bandwidth in spacings of the lattice, so that it means the same on any lattice.
+The values of a study are numbers and strings. Most have a log scale: 1 - γ and 1 - λ instead of γ and λ, the number of
+points per dimension, and the bandwidth in lattice spacings, which makes it independent of the lattice.
 
-Points that a configuration gives for each dimension are knowledge of the problem, which a study keeps; likewise action
-points.
+If a configuration gives the points per dimension, a study keeps them as prior knowledge; likewise action points.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ class SearchSpace(NamedTuple):
     convert: Callable[[Params], Params]
 
 
-#: Attribute of a trial: number of observation dimensions, 0 for finite states, which have no lattice.
+#: Trial attribute: number of observation dimensions, 0 for finite states, which have no lattice.
 OBS_DIM = "obs_dim"
 
-#: Attribute of a trial: number of points in all, if the configuration gives them for each dimension, otherwise 0.
+#: Trial attribute: total number of points if the configuration gives them per dimension, otherwise 0.
 KEPT_POINTS = "kept_points"
 
-#: Attribute of a trial: whether the configuration gives the action points for each dimension.
+#: Trial attribute: whether the configuration gives the action points per dimension.
 KEEPS_ACTION_POINTS = "keeps_action_points"
 
-#: Lattices are searched up to about so many points in all, with at most so many in a dimension.
+#: Approximate largest number of points of a searched lattice, in total and per dimension.
 MOST_POINTS = 20_000
 MOST_POINTS_PER_DIMENSION = 40
 
@@ -56,7 +56,7 @@ def sample_knntd_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    :param trial: trial with what :func:`attributes` says
+    :param trial: trial with the user attributes of :func:`attributes`
     :param n_actions: not used
     :param n_envs: not used
     :param additional_args: not used
@@ -72,10 +72,10 @@ def sample_knntd_params(
 def convert_knntd_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: values of a study of :class:`~sb3_knntd.KNNTD`
-    :return: arguments as a configuration has them
+    :return: arguments in the format of a configuration
     """
     params = _convert_common(sampled_params)
-    # Softmax is to end near greedy, as ε-greedy does.
+    # Softmax should end nearly greedy, like ε-greedy.
     temperature = params.pop("initial_temperature")
     params["temperature"] = f"lin_{temperature}_{temperature / 100}"
     return params
@@ -85,7 +85,7 @@ def sample_exa_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
-    :param trial: trial with what :func:`attributes` says
+    :param trial: trial with the user attributes of :func:`attributes`
     :param n_actions: not used
     :param n_envs: not used
     :param additional_args: not used
@@ -102,13 +102,13 @@ def sample_exa_params(
 def convert_exa_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: values of a study of :class:`~sb3_knntd.ExA`
-    :return: arguments as a configuration has them
+    :return: arguments in the format of a configuration
     """
     return _convert_common(sampled_params)
 
 
 def _sample_common(trial: optuna.Trial) -> Params:
-    """What both algorithms have. Every value is asked for in every trial, as multivariate samplers need it."""
+    """Sample the values of both algorithms, all of them in every trial, as multivariate samplers require."""
     params: Params = {
         "initial_learning_rate": trial.suggest_float("initial_learning_rate", 0.05, 1.0, log=True),
         "final_learning_rate_share": trial.suggest_float("final_learning_rate_share", 0.01, 1.0, log=True),
@@ -117,7 +117,7 @@ def _sample_common(trial: optuna.Trial) -> Params:
         "traces": trial.suggest_categorical("traces", ["replacing", "accumulating"]),
         "initial_value_sign": trial.suggest_categorical("initial_value_sign", [-1, 0, 1]),
         "initial_value_size": trial.suggest_float("initial_value_size", 0.1, 1000.0, log=True),
-        # From next to nothing: where rewards are negative, a table of zeros explores by itself.
+        # Down to almost 0: if rewards are negative, a table of zeros is optimistic and explores by itself.
         "exploration_initial_eps": trial.suggest_float("exploration_initial_eps", 0.001, 1.0, log=True),
         "exploration_fraction": trial.suggest_float("exploration_fraction", 0.1, 1.0),
     }
@@ -147,7 +147,7 @@ def _convert_common(sampled_params: Params) -> Params:
     params["initial_value"] = params.pop("initial_value_sign") * params.pop("initial_value_size")
     if "points_per_dimension" in params:
         params["points"] = params.pop("points_per_dimension")
-        # In scaled units a lattice is 2 wide.
+        # A lattice has a width of 2 in scaled units.
         params["bandwidth"] = params.pop("bandwidth_in_spacings") * 2 / (params["points"] - 1)
     return params
 
@@ -156,7 +156,7 @@ def attributes(obs_dim: int, configuration: Mapping[str, Any]) -> dict[str, Any]
     """
     :param obs_dim: number of observation dimensions, 0 for finite states
     :param configuration: arguments of the algorithm
-    :return: what a trial's user attributes must say for a sampler
+    :return: user attributes of a trial that the samplers need
     """
     points = configuration.get("points", "auto")
     n_points = 0
@@ -173,11 +173,11 @@ def attributes(obs_dim: int, configuration: Mapping[str, Any]) -> dict[str, Any]
 
 def study_values(algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any]) -> Params:
     """
-    The inverse of a converter.
+    Convert arguments to values of a study, the inverse of a converter.
 
     :param algorithm: :class:`~sb3_knntd.KNNTD` or :class:`~sb3_knntd.ExA`
-    :param configuration: arguments of the algorithm, schedules as functions; its defaults for those that are not there
-    :return: values of a study, as far as a study has values for them
+    :param configuration: arguments of the algorithm, schedules as functions; missing ones have their defaults
+    :return: values of a study, and arguments that a study does not search
     """
     defaults = {name: parameter.default for name, parameter in inspect.signature(algorithm).parameters.items()}
     values = defaults | dict(configuration)
@@ -206,7 +206,7 @@ def study_values(algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any
 
 
 def _arguments(trial: optuna.Trial, params: Params) -> Params:
-    """Arguments ready to use. Those a study has in another form are stored with the trial, to be read."""
+    """Convert schedules to functions, and store converted arguments with the trial for reference."""
     for name in params.keys() - trial.params.keys():
         trial.set_user_attr(name, params[name])
     return with_schedules(params)

@@ -1,3 +1,3 @@
-"""Algorithms to compare with."""
+"""Baseline algorithms for comparisons."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The floor of every comparison: actions drawn at random."""
+"""Random actions, the lower baseline of every comparison."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sb3_knntd.online_algorithm import OnlineAlgorithm
 
 class RandomPolicy(BasePolicy):
     """
-    Draws actions from the action space, and looks at nothing.
+    Samples actions from the action space, independently of the observation.
 
-    :param observation_space: any
-    :param action_space: any that SB3 knows
+    :param observation_space: observation space
+    :param action_space: any action space that SB3 supports
     """
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
@@ -27,24 +27,24 @@ class RandomPolicy(BasePolicy):
 
     def draw(self, n_envs: int) -> np.ndarray:
         """
-        :param n_envs: how many actions
-        :return: actions, shape (n_envs, *action_shape)
+        :param n_envs: number of actions
+        :return: random actions, shape (n_envs, *action_shape)
         """
         return np.stack([np.asarray(self.action_space.sample()) for _ in range(n_envs)])
 
 
 class RandomAgent(OnlineAlgorithm):
     """
-    Acts at random and learns nothing.
+    An algorithm that takes random actions and does not learn.
 
     :param policy: ``"RandomPolicy"``
-    :param env: environment, or the id of one
+    :param env: environment, or its id
     :param policy_kwargs: not used; part of SB3's signature
-    :param tensorboard_log: folder of the TensorBoard log, ``None`` for none
+    :param tensorboard_log: folder of the TensorBoard log, ``None`` for no log
     :param verbose: 0 for no output
     :param seed: seed of the actions and the environment
-    :param device: of the tensors
-    :param _init_setup_model: whether to build the policy at once
+    :param device: device of the tensors
+    :param _init_setup_model: whether to build the policy in the constructor
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"RandomPolicy": RandomPolicy}

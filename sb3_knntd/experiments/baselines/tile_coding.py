@@ -1,4 +1,4 @@
-"""Tile coding: which tile of each of several displaced grids an observation lies in."""
+"""Tile coding: the tile of an observation in each of several offset grids."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from torch import nn
 from sb3_knntd.kernels.jit import jit
 from sb3_knntd.perception.bounds import Bounds
 
-#: More tiles than this, a prime number, share so many weights.
+#: Largest number of weights, a prime. More tiles share them.
 MOST_FEATURES = 4_194_301
 
 
 class TileCoder(nn.Module):
     """
-    Several grids over the observation space (Sutton and Barto, 2nd ed., section 9.5.4), each displaced by other shares
-    of a tile: tiling i by (1, 3, 5, ...) i / n_tilings of a tile in dimensions 0, 1, 2, ..., less its whole part.
+    Several grids over the observation space (Sutton and Barto, 2nd ed., section 9.5.4). Tiling i is offset by the
+    fractional part of (1, 3, 5, ...) i / n_tilings tiles in dimensions 0, 1, 2, ...
 
-    Every tile is a feature. If there are more than 4,194,301 of them, their numbers are taken modulo that prime.
-    Observations outside of the bounds count as on the bounds.
+    Every tile is a feature. If there are more than 4,194,301 features, their indices are taken modulo that prime.
+    Observations outside the bounds are clipped to the bounds.
 
     :param bounds: range of the observations
-    :param n_tiles: tiles over the range of each dimension, shape (obs_dim,)
+    :param n_tiles: number of tiles over the range of each dimension, shape (obs_dim,)
     :param n_tilings: number of grids
     """
 
@@ -35,17 +35,17 @@ class TileCoder(nn.Module):
         steps = np.outer(np.arange(n_tilings), 2 * np.arange(bounds.obs_dim) + 1)
         self.register_buffer("n_tiles", th.from_numpy(n_tiles.astype(np.int64)))
         self.register_buffer("offsets", th.from_numpy(steps % n_tilings / n_tilings))
-        # A displaced grid needs one tile more in each dimension.
+        # An offset grid needs one more tile per dimension.
         n_features = n_tilings * int(np.prod(n_tiles.astype(object) + 1))
         #: Number of features.
         self.n_features = min(n_features, MOST_FEATURES)
-        # Views of the buffers: to ask torch for them at every step would take longer than the step.
+        # Views of the buffers, because accessing them through torch takes longer than a step.
         self._grids = bounds.low.numpy(), bounds.high.numpy(), self.n_tiles.numpy(), self.offsets.numpy()
 
     def encode(self, observations: np.ndarray) -> np.ndarray:
         """
         :param observations: shape (batch, obs_dim), observation units
-        :return: numbers of the features that are 1, one a tiling, shape (batch, n_tilings); all others are 0
+        :return: indices of the active features, one per tiling, shape (batch, n_tilings)
         """
         features = np.empty((len(observations), len(self._grids[-1])), np.int64)
         active_tiles(np.asarray(observations, np.float64), *self._grids, self.n_features, features)
@@ -70,8 +70,8 @@ def active_tiles(
     :param high: shape (obs_dim,)
     :param n_tiles: shape (obs_dim,)
     :param offsets: shape (n_tilings, obs_dim), in tiles
-    :param n_features: how many there are
-    :param features: what is filled
+    :param n_features: number of features
+    :param features: output array
     """
     for row in range(features.shape[0]):
         for tiling in range(features.shape[1]):

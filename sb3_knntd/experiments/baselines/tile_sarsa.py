@@ -1,4 +1,4 @@
-"""True online SARSA(λ) with tile coding, the classical rival of a table of neighbours."""
+"""True online SARSA(λ) with tile coding, the classical alternative to a nearest-neighbour table."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from sb3_knntd.kernels.jit import jit
 from sb3_knntd.online_algorithm import OnlineAlgorithm
 from sb3_knntd.perception.bounds import MEASURING_STEPS, make_bounds
 
-#: A trace that has decayed below this is forgotten.
+#: Traces below this are dropped.
 SMALLEST_TRACE = 1e-10
 
 
 class TilePolicy(BasePolicy):
     """
-    A weight for every tile and action; the value of an action is the sum of the weights of the active tiles.
+    A linear policy with one weight per tile and action; the value of an action is the sum of the weights of the active
+    tiles.
 
     :param observation_space: Box of shape (obs_dim,)
     :param action_space: Discrete
     :param n_tiles: tiles over the range of a dimension: one number, or one for each dimension
-    :param n_tilings: number of displaced grids
-    :param bounds: ``None`` for the space's own, or (low, high), arrays of shape (obs_dim,) in observation units
-    :param initial_value: value of every action in every state at the start
-    :raises ValueError: if an argument does not fit
+    :param n_tilings: number of offset grids
+    :param bounds: ``None`` for those of the space, or (low, high), arrays of shape (obs_dim,) in observation units
+    :param initial_value: initial value of all actions
+    :raises ValueError: if an argument is invalid
     """
 
     action_space: spaces.Discrete
@@ -59,7 +60,7 @@ class TilePolicy(BasePolicy):
             check_integer("n_tiles", number, 1)
         self.coder = TileCoder(make_bounds(bounds, observation_space), np.array(tiles), n_tilings)
         shape = int(action_space.n), self.coder.n_features
-        # Zeros take memory only where they are written to.
+        # Zeros use memory only once they are written to.
         weights = th.zeros(shape, dtype=th.float64)
         self.register_buffer("weights", weights + initial_value / n_tilings if initial_value else weights)
 
@@ -78,13 +79,13 @@ class TilePolicy(BasePolicy):
 
 class Traces(NamedTuple):
     """
-    Eligibility traces, of which only those that are not zero are listed.
+    Sparse eligibility traces: a list of the features whose trace is not zero.
 
-    :param slots: by feature, its place in the list counted from 1, or 0 if it is not there, shape
+    :param slots: position of each feature in the list, counted from 1, or 0 if it is not in the list, shape
         (n_actions * n_features,)
-    :param features: the list, shape (n_actions * n_features,), filled from the beginning
-    :param values: traces of those in the list
-    :param n_listed: how many are in the list, shape (1,)
+    :param features: the list, shape (n_actions * n_features,), filled from the start
+    :param values: traces of the listed features
+    :param n_listed: length of the list, shape (1,)
     """
 
     slots: np.ndarray
@@ -96,31 +97,31 @@ class Traces(NamedTuple):
 class TileSarsa(OnlineAlgorithm):
     """
     True online SARSA(λ) (van Seijen et al., JMLR 17, 2016; Sutton and Barto, 2nd ed., section 12.7) with tile coding,
-    ε-greedy, for one environment with a Box of observations and Discrete actions.
+    ε-greedy, for a single environment with Box observations and Discrete actions.
 
-    Like KNNTD, it takes the range of a dimension that has none from its first 1000 steps, at random. An episode that is
-    cut by a time limit bootstraps from its last observation.
+    Like KNNTD, it measures the range of unbounded dimensions in the first 1000 steps, with random actions. After a
+    truncation the target bootstraps from the last observation.
 
     :param policy: ``"TilePolicy"``
-    :param env: environment, or the id of one
-    :param learning_rate: α times n_tilings, the share of the error that one update removes, from 0 to 1; number or
+    :param env: environment, or its id
+    :param learning_rate: α times n_tilings, the share of the error that one update removes, in [0, 1]; number or
         schedule
-    :param gamma: γ, from 0 to 1
-    :param trace_decay: λ, from 0 to 1
+    :param gamma: γ, in [0, 1]
+    :param trace_decay: λ, in [0, 1]
     :param n_tiles: tiles over the range of a dimension: one number, or one for each dimension
-    :param n_tilings: number of displaced grids
-    :param bounds: ``None`` for the space's own, or (low, high), arrays of shape (obs_dim,) in observation units
-    :param initial_value: value of every action in every state at the start
-    :param exploration_fraction: as in SB3's DQN: share of the training over which ε changes, above 0 and up to 1
-    :param exploration_initial_eps: ε at the start, from 0 to 1
-    :param exploration_final_eps: ε after that, from 0 to 1
+    :param n_tilings: number of offset grids
+    :param bounds: ``None`` for those of the space, or (low, high), arrays of shape (obs_dim,) in observation units
+    :param initial_value: initial value of all actions
+    :param exploration_fraction: share of the training over which ε changes, in (0, 1], as in SB3's DQN
+    :param exploration_initial_eps: initial ε, in [0, 1]
+    :param exploration_final_eps: final ε, in [0, 1]
     :param policy_kwargs: not used; part of SB3's signature
-    :param tensorboard_log: folder of the TensorBoard log, ``None`` for none
+    :param tensorboard_log: folder of the TensorBoard log, ``None`` for no log
     :param verbose: 0 for no output
-    :param seed: seed of exploration, ties and the environment
+    :param seed: seed of exploration, tie breaking and the environment
     :param device: ``"cpu"``
-    :param _init_setup_model: whether to build the policy at once
-    :raises ValueError: if an argument does not fit, or there are several environments
+    :param _init_setup_model: whether to build the policy in the constructor
+    :raises ValueError: if an argument is invalid, or there are several environments
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TilePolicy": TilePolicy}
@@ -174,7 +175,7 @@ class TileSarsa(OnlineAlgorithm):
             "initial_value": initial_value,
         }
         self._q_old = 0.0
-        #: Features of the last observation and the action chosen there; None before the first step of an episode.
+        #: Active features of the last observation; None before the first step of an episode.
         self._last_features: np.ndarray | None = None
         self._last_action = 0
         if _init_setup_model:
@@ -193,7 +194,7 @@ class TileSarsa(OnlineAlgorithm):
         size = self.policy.weights.numel()
         self._weights = self.policy.weights.numpy()
         self._traces = Traces(np.zeros(size, np.int32), np.zeros(size, np.int64), np.zeros(size), np.zeros(1, np.int64))
-        #: Steps at the start that only measure the range of the observations.
+        #: Number of initial steps that only measure the range of the observations.
         self._measuring_steps = MEASURING_STEPS if self.policy.coder.bounds.is_open else 0
 
     def _excluded_save_params(self) -> list[str]:
@@ -214,7 +215,7 @@ class TileSarsa(OnlineAlgorithm):
             self._q_old, self._last_features = 0.0, None
 
     def _choose(self, features: np.ndarray) -> int:
-        """ε-greedy, ties at random; random while the range of the observations is being measured."""
+        """ε-greedy with random tie breaking; random while the range of the observations is being measured."""
         measuring = self.num_timesteps < self._measuring_steps
         epsilon = 1.0 if measuring else self.exploration_schedule(self._current_progress_remaining)
         return int(choose(self._weights, features, epsilon, *self._random.random(2)))
@@ -225,7 +226,7 @@ class TileSarsa(OnlineAlgorithm):
         done = bool(dones[0])
         last_obs = infos[0]["terminal_observation"] if done else new_obs[0]
         if self.num_timesteps <= self._measuring_steps:
-            # Tiles that still move cannot be learned on.
+            # No updates while the tiles still move.
             self.policy.coder.bounds.measure(th.as_tensor(last_obs, dtype=th.float64)[None])
             self._last_features = None
             return
@@ -255,13 +256,13 @@ class TileSarsa(OnlineAlgorithm):
 @jit
 def choose(weights: np.ndarray, features: np.ndarray, epsilon: float, first: float, second: float) -> int:
     """
-    An action, ε-greedy, ties at random.
+    Select an action ε-greedily, with random tie breaking.
 
     :param weights: shape (n_actions, n_features)
     :param features: active features, shape (n_tilings,)
     :param epsilon: ε
-    :param first: random number in [0, 1), whether to explore
-    :param second: random number in [0, 1), which action among those that are equal
+    :param first: random number in [0, 1) that decides whether to explore
+    :param second: random number in [0, 1) that selects the random action or breaks ties
     :return: the action, counted from 0
     """
     n_actions = weights.shape[0]
@@ -299,15 +300,15 @@ def learn_step(
     :param listed: as in :class:`Traces`, ``features`` there
     :param values: as in :class:`Traces`
     :param n_listed: as in :class:`Traces`
-    :param features: x, active in the last state with the action taken, shape (n_tilings,)
-    :param next_features: x', active in this state with the action chosen
+    :param features: x, active features of the last state and action, shape (n_tilings,)
+    :param next_features: x', active features of the current state and the selected action
     :param reward: R
-    :param terminated: whether this state is terminal
-    :param q_old: what the last update returned, 0 at the start of an episode
+    :param terminated: whether the current state is terminal
+    :param q_old: return value of the last update, 0 at the start of an episode
     :param alpha: α
     :param gamma: γ
     :param trace_decay: λ
-    :return: Q', the value of this state and action before the update
+    :return: Q', the value of the current state and action before the update
     """
     q, q_next, trace = 0.0, 0.0, 0.0
     for feature in features:
@@ -347,11 +348,11 @@ def learn_step(
 @jit
 def forget(slots: np.ndarray, listed: np.ndarray, n_listed: np.ndarray) -> None:
     """
-    Set all traces to 0; arguments as in :func:`learn_step`.
+    Set all traces to 0.
 
-    :param slots: by feature, its place in the list
+    :param slots: position of each feature in the list
     :param listed: the features in the list
-    :param n_listed: how many
+    :param n_listed: length of the list
     """
     for slot in range(n_listed[0]):
         slots[listed[slot]] = 0

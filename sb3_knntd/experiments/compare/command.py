@@ -1,4 +1,4 @@
-"""``sb3-knntd compare``: from environments, algorithms and seeds to runs, and from runs to a report."""
+"""``sb3-knntd compare``: run algorithms on environments with several seeds and write a report."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from sb3_knntd.experiments.compare.report import make_report
 from sb3_knntd.experiments.compare.results import Comparison, Run, Task, make_groups
 from sb3_knntd.experiments.compare.run import is_result, run
 
-#: What a local worker finds imported.
+#: Modules that local workers preload.
 PRELOADED = ("sb3_knntd.experiments.compare.run",)
 
 
 class Plan(NamedTuple):
     """
-    What to compare; the arguments of the command.
+    The arguments of the command.
 
-    :param envs: environments
-    :param algos: names of algorithms; acting at random is always added
-    :param seeds: of the runs
-    :param steps: environment steps of each run
-    :param defaults: whether algorithms have their defaults, not the tuned configurations
-    :param conf: by algorithm, a file of configurations
-    :param thresholds: by environment, the return that counts as having learned it
-    :param eval_points: evaluations of each run
-    :param eval_episodes: episodes of each
+    :param envs: ids of the environments
+    :param algos: names of the algorithms; random actions are always added
+    :param seeds: seeds of the runs
+    :param steps: environment steps per run
+    :param defaults: whether to use the algorithms' default parameters instead of the tuned configurations
+    :param conf: configuration files by algorithm
+    :param thresholds: by environment, the mean return that counts as solved
+    :param eval_points: evaluations per run
+    :param eval_episodes: episodes per evaluation
     :param packages: modules that register environments
-    :param out: folder for all files
+    :param out: output folder
     """
 
     envs: Sequence[str]
@@ -59,7 +59,7 @@ class Plan(NamedTuple):
 
     @property
     def command(self) -> str:
-        """The command line that computes the same, wherever it is computed."""
+        """The command line that reproduces the results, without the options of the backend."""
         words: list[Any] = ["sb3-knntd", "compare", "--env", *self.envs, "--algos", *self.algos]
         words += ["--seeds", len(self.seeds), "--first-seed", self.seeds[0], "--steps", self.steps]
         words += ["--defaults"] if self.defaults else []
@@ -73,7 +73,9 @@ class Plan(NamedTuple):
 
 class Key(NamedTuple):
     """
-    :param env: environment
+    Identifies a run.
+
+    :param env: id of the environment
     :param algo: name of the algorithm
     :param seed: seed of the run
     """
@@ -92,16 +94,16 @@ def compare(
     memory: float | None = None,
 ) -> int:
     """
-    Compute what is missing, write the report, and say where it is.
+    Compute the missing runs, write the report, and print its path.
 
-    :param plan: what to compare
+    :param plan: arguments of the command
     :param backend: ``"local"`` or ``"ray"``
-    :param workers: processes of this machine, ``None`` for one a core
-    :param address: of the Ray cluster
-    :param cpus: CPUs that Ray reserves for a run
-    :param memory: GiB that it reserves for a run, ``None`` for none
+    :param workers: number of local processes, ``None`` for one per core
+    :param address: address of the Ray cluster
+    :param cpus: CPUs that Ray reserves per run
+    :param memory: memory that Ray reserves per run, GiB, ``None`` for no reservation
     :return: exit code: 0, or 1 if runs failed
-    :raises CommandError: if the plan cannot be carried out, before anything is computed
+    :raises CommandError: if an argument is invalid; raised before anything is computed
     """
     try:
         prepare(plan.packages)
@@ -128,7 +130,7 @@ def compare(
         print(f"Failed: {name}\n{reason}", file=sys.stderr)
     comparison = gather(plan, chosen, by_key, failures)
     if not comparison.tasks:
-        print("Nothing came through: no report. The same command tries again.", file=sys.stderr)
+        print("No environment has complete results: no report. Run the same command to try again.", file=sys.stderr)
         return 1
     for name, content in make_report(comparison).items():
         path = plan.out / name
@@ -136,20 +138,20 @@ def compare(
         replace_file(path, content)
     print(plan.out / "report.html")
     if failures:
-        print(f"{len(failures)} of {len(jobs)} runs failed: the same command tries them again.", file=sys.stderr)
+        print(f"{len(failures)} of {len(jobs)} runs failed. Run the same command to try them again.", file=sys.stderr)
     return 1 if failures else 0
 
 
 def check_plan(plan: Plan) -> None:
     """
-    :param plan: what to compare
-    :raises CommandError: if a name is unknown, or numbers do not go together
+    :param plan: arguments of the command
+    :raises CommandError: if a name is unknown, or arguments are inconsistent
     """
     known = [algo for algo in rl_zoo3.ALGOS if algo != FLOOR]
     for option, names in (("--algos", plan.algos), ("--conf", plan.conf)):
         for name in names:
             if name not in rl_zoo3.ALGOS:
-                raise CommandError(f"{option}: there is no algorithm {name!r}, but {', '.join(sorted(known))}")
+                raise CommandError(f"{option}: unknown algorithm {name!r}; known are {', '.join(sorted(known))}")
     for env in plan.envs:
         make_env(env).close()
     for env in plan.thresholds:
@@ -161,10 +163,11 @@ def check_plan(plan: Plan) -> None:
 
 def choose_configurations(plan: Plan, algos: Sequence[str]) -> dict[tuple[str, str], Configuration]:
     """
-    :param plan: what to compare
+    :param plan: arguments of the command
     :param algos: names of algorithms
-    :return: by environment and algorithm that can take its actions, the configuration; each was built once
-    :raises CommandError: if a configuration cannot be read or built, or an algorithm fits no environment
+    :return: configurations by environment and algorithm, for algorithms that support the action space; a model was
+        built from each to check it
+    :raises CommandError: if a configuration cannot be read or built, or an algorithm supports none of the environments
     """
     chosen = {}
     for env in plan.envs:
@@ -179,19 +182,19 @@ def choose_configurations(plan: Plan, algos: Sequence[str]) -> dict[tuple[str, s
                 raise CommandError(f"{algo} on {env}: {type(error).__name__}: {error}") from error
     for algo in algos:
         if not any(algo == other for _, other in chosen):
-            raise CommandError(f"--algos: {algo} takes the actions of none of {', '.join(plan.envs)}")
+            raise CommandError(f"--algos: {algo} supports the action space of none of {', '.join(plan.envs)}")
     return chosen
 
 
 def make_job(plan: Plan, env: str, algo: str, seed: int, hyperparams: Mapping[str, Any]) -> Job:
     """
-    :param plan: what to compare
-    :param env: environment
+    :param plan: arguments of the command
+    :param env: id of the environment
     :param algo: name of the algorithm
     :param seed: seed of the run
-    :param hyperparams: its configuration
-    :return: the job; its name tells all that its result depends on, so that results of several plans can be in one
-        folder
+    :param hyperparams: configuration of the algorithm
+    :return: the job; its name contains a hash of everything that the result depends on, so that results of several
+        plans can share a folder
     """
     arguments = {
         "env": env,
@@ -215,11 +218,11 @@ def gather(
     failures: Mapping[str, str],
 ) -> Comparison:
     """
-    :param plan: what was compared
+    :param plan: arguments of the command
     :param chosen: the configurations
-    :param outcomes: what became of the runs
-    :param failures: by name of a run that failed, why
-    :return: what there is to report; without an environment on which nothing, or nothing random, came through
+    :param outcomes: outcomes of the runs
+    :param failures: error messages by name of the failed run
+    :return: the comparison to report; without environments that have no finished runs of random actions
     """
     tasks = []
     for env in plan.envs:
@@ -231,7 +234,7 @@ def gather(
         if FLOOR in runs:
             tasks.append(Task(env, runs, plan.thresholds.get(env, spec.reward_threshold)))
     left_out = [
-        f"{label(algo)} cannot take the actions of {env}."
+        f"{label(algo)} does not support the action space of {env}."
         for env in plan.envs
         for algo in dict.fromkeys(plan.algos)
         if (env, algo) not in chosen and algo != FLOOR

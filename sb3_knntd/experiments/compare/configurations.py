@@ -1,4 +1,4 @@
-"""Which configuration an algorithm gets for an environment."""
+"""Selection of the configuration for an algorithm and an environment."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ RELATED = {
     "sb3_knntd/CartPole-v0": "CartPole-v1",
     "sb3_knntd/Acrobot-v0": "Acrobot-v1",
 }
-#: Entries of a configuration that only say how long RL Zoo trains.
+#: Entry of a configuration with the number of training steps.
 DURATION = "n_timesteps"
 
 
 class Configuration(NamedTuple):
     """
-    :param hyperparams: in RL Zoo's form, as JSON gives them back
-    :param source: where they are from, for the reader of the report
-    :param tuned_steps: for how many steps they were made, ``None`` if they do not say
+    The configuration of an algorithm for an environment.
+
+    :param hyperparams: hyperparameters in RL Zoo's format, JSON-serializable
+    :param source: origin of the configuration, shown in the report
+    :param tuned_steps: number of steps that it was tuned for, ``None`` if unknown
     """
 
     hyperparams: dict[str, Any]
@@ -50,7 +52,7 @@ class Configuration(NamedTuple):
 def label(algo: str) -> str:
     """
     :param algo: name of an algorithm
-    :return: what it is called in tables and pictures
+    :return: its name in tables and plots
     """
     if algo in ALGORITHMS:
         return ALGORITHMS[algo].label
@@ -68,8 +70,8 @@ def is_own(algo: str) -> bool:
 def fits(algo: str, env_id: str) -> bool:
     """
     :param algo: name of an algorithm
-    :param env_id: environment
-    :return: whether it can take the environment's actions
+    :param env_id: id of the environment
+    :return: whether it supports the action space
     """
     action_space = ALGORITHMS[algo].action_space if algo in ALGORITHMS else BASELINES.get(algo, spaces.Space)
     return isinstance(_spaces(env_id)[1], action_space)
@@ -78,13 +80,13 @@ def fits(algo: str, env_id: str) -> bool:
 def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Path]) -> Configuration:
     """
     :param algo: name of an algorithm
-    :param env_id: environment
-    :param defaults: whether it is to have its own defaults
-    :param conf: by algorithm, a file in RL Zoo's form that is to be taken instead
-    :return: the entry of the environment in that file, or in RL Zoo's or this package's own, else the entry of the
-        environment it is a form of (:data:`RELATED`), else the entry ``default`` there, else the algorithm's defaults
-    :raises ValueError: if a file that was named has neither entry, or is none in RL Zoo's form
-    :raises OSError: if it cannot be read
+    :param env_id: id of the environment
+    :param defaults: whether to use the algorithm's default parameters
+    :param conf: configuration files in RL Zoo's format by algorithm, used instead of the usual ones
+    :return: the file's entry for the environment, else for the environment in :data:`RELATED`, else its entry
+        ``default``, else the algorithm's default parameters
+    :raises ValueError: if a file in ``conf`` has none of these entries, or is not in RL Zoo's format
+    :raises OSError: if a file cannot be read
     """
     plain = Configuration({"policy": _policy(algo, env_id)}, "the algorithm's defaults")
     if algo == FLOOR or (defaults and algo not in conf):
@@ -100,7 +102,7 @@ def configuration(algo: str, env_id: str, defaults: bool, conf: Mapping[str, Pat
         path, source = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml", f"{algo}.yml of RL Zoo"
     entries = yaml.safe_load(path.read_text(encoding="utf-8"))
     if not isinstance(entries, dict):
-        raise ValueError(f"{path} must have an entry for each environment, as RL Zoo's files do")
+        raise ValueError(f"{path} must map environments to hyperparameters, like RL Zoo's files")
     for entry in (env_id, RELATED.get(env_id, env_id), "default"):
         if entry in entries:
             found = json.loads(json.dumps(entries[entry]))

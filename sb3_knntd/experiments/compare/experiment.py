@@ -1,4 +1,4 @@
-"""From an environment, an algorithm and its configuration to a model that is ready to learn."""
+"""Build models and environments from RL Zoo configurations."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from sb3_knntd.zoo.experiment import KNNExperimentManager
 
 def prepare(packages: Sequence[str] = ()) -> None:
     """
-    Make all algorithms and environments known in this process.
+    Register all algorithms and environments in this process.
 
     :param packages: modules that register further environments
-    :raises Exception: whatever importing one of them does, ModuleNotFoundError if it is not there
+    :raises Exception: any exception of importing a package, such as ModuleNotFoundError
     """
     register()
     rl_zoo3.ALGOS.update({name: algorithm.load() for name, algorithm in ALGORITHMS.items()})
@@ -38,14 +38,14 @@ def prepare(packages: Sequence[str] = ()) -> None:
 
 class Experiment(KNNExperimentManager):
     """
-    RL Zoo's experiment, with a configuration that is given and nothing stored.
+    RL Zoo's experiment manager with given hyperparameters, which stores no results.
 
     :param algo: name of the algorithm
-    :param env_id: environment
-    :param hyperparams: its configuration, in RL Zoo's form
-    :param steps: environment steps, which schedules run over
+    :param env_id: id of the environment
+    :param hyperparams: configuration in RL Zoo's format
+    :param steps: number of environment steps, over which schedules run
     :param seed: seed of the model and its environments
-    :param folder: for what RL Zoo writes
+    :param folder: folder for the files that RL Zoo writes
     """
 
     def __init__(self, algo: str, env_id: str, hyperparams: dict[str, Any], steps: int, seed: int, folder: str) -> None:
@@ -64,8 +64,8 @@ class Experiment(KNNExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], OrderedDict[str, Any]]:
         """
-        :return: the configuration that was given, to be preprocessed and to be stored
-        :raises ValueError: if it has in it what would have to be run
+        :return: the given configuration, for preprocessing and for storage
+        :raises ValueError: if it contains code
         """
         hyperparams = as_data(copy.deepcopy(self._given)) | {"n_timesteps": self.n_timesteps}
         self.eval_env_kwargs = hyperparams.get("env_kwargs", {})
@@ -75,8 +75,8 @@ class Experiment(KNNExperimentManager):
         """
         :param n_envs: number of environments
         :param eval_env: whether they are for evaluation
-        :param no_log: not used: a file of episodes would take time that is no part of learning
-        :return: the environments, with the wrappers of the configuration
+        :param no_log: not used; writing a monitor file would add to the learning time
+        :return: the environments with the wrappers of the configuration
         """
         return super().create_envs(n_envs, eval_env, no_log=True)
 
@@ -86,16 +86,16 @@ def experiment(
     algo: str, env_id: str, hyperparams: dict[str, Any], steps: int, seed: int
 ) -> Iterator[tuple[Experiment, BaseAlgorithm, list[BaseCallback]]]:
     """
-    Build what is compared; :func:`prepare` has been called.
+    Build the model and environments of a run. Call :func:`prepare` first.
 
     :param algo: name of the algorithm
-    :param env_id: environment
-    :param hyperparams: its configuration, in RL Zoo's form
-    :param steps: environment steps, which schedules run over
+    :param env_id: id of the environment
+    :param hyperparams: configuration in RL Zoo's format
+    :param steps: number of environment steps, over which schedules run
     :param seed: seed of the model and its environments
-    :return: the experiment, its model, and the callbacks that the configuration asks for
+    :return: the experiment, its model, and the callbacks of the configuration
     """
-    # RL Zoo tells on standard output what it reads and builds, and stores it.
+    # RL Zoo prints and stores what it builds.
     with tempfile.TemporaryDirectory() as folder:
         with redirect_stdout(StringIO()):
             manager = Experiment(algo, env_id, hyperparams, steps, seed, folder)

@@ -1,4 +1,4 @@
-"""What RL Zoo would evaluate of a configuration as Python, read as data: a configuration is no program."""
+"""Safe reading of configurations: RL Zoo evaluates some entries as Python, here they are parsed as data."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from torch import nn
 
 #: Entries that may be an expression.
 EXPRESSIONS = ("normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "monitor_kwargs")
-#: Names that an expression may have in it, besides classes of ``torch.nn`` as ``nn.ReLU``.
+#: Names allowed in expressions, besides classes of ``torch.nn`` such as ``nn.ReLU``.
 NAMES: dict[str, Any] = {"HerReplayBuffer": HerReplayBuffer, "RMSpropTFLike": RMSpropTFLike}
-#: Entries that name classes, and what these must be.
+#: Entries with names of classes, and the required base classes.
 CLASSES: dict[str, type] = {
     "env_wrapper": gym.Wrapper,
     "vec_env_wrapper": VecEnvWrapper,
@@ -31,10 +31,10 @@ CLASSES: dict[str, type] = {
 
 def as_data(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
     """
-    :param hyperparams: in RL Zoo's form
-    :return: the same, with the values of its expressions
-    :raises ValueError: if an expression is more than literals, ``dict(...)`` and the names of :data:`NAMES`, or a class
-        is none that fits its place
+    :param hyperparams: hyperparameters in RL Zoo's format
+    :return: a copy with expressions replaced by their values
+    :raises ValueError: if an expression contains more than literals, ``dict(...)`` and the names of :data:`NAMES`, or a
+        class does not have the required base class
     """
     for entry, root in CLASSES.items():
         for name in _class_names(hyperparams.get(entry)):
@@ -45,10 +45,10 @@ def as_data(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
 
 def evaluate(name: str, expression: str) -> Any:
     """
-    :param name: name of the entry, for the message
-    :param expression: literals, ``dict(...)``, and names
-    :return: its value; nothing else is called
-    :raises ValueError: if there is more in it
+    :param name: name of the entry, for the error message
+    :param expression: literals, ``dict(...)`` and allowed names
+    :return: its value
+    :raises ValueError: if the expression contains anything else
     """
     try:
         return _value(ast.parse(expression.strip(), mode="eval").body)
@@ -80,16 +80,16 @@ def _value(node: ast.expr) -> Any:
 def _class_names(value: Any) -> Iterator[Any]:
     for item in value if isinstance(value, list) else [value]:
         name = next(iter(item), None) if isinstance(item, dict) else item
-        # A word without a dot is a policy's alias.
+        # A name without a dot is a policy alias.
         if isinstance(name, str) and "." in name:
             yield name
 
 
 def _check_class(entry: str, name: str, root: type) -> None:
-    """RL Zoo imports what has this name and calls it."""
+    """Check a class that RL Zoo will import and call."""
     module, _, attribute = name.rpartition(".")
     found = None
-    # What belongs to no package that is in use would be run by importing it.
+    # Importing an arbitrary package would run its code.
     if module.partition(".")[0] in sys.modules:
         try:
             found = getattr(importlib.import_module(module), attribute, None)
@@ -97,6 +97,6 @@ def _check_class(entry: str, name: str, root: type) -> None:
             raise ValueError(f"{entry}: {error}") from error
     if not (isinstance(found, type) and issubclass(found, root)):
         raise ValueError(
-            f"{entry} must be the name of a {root.__name__} in a package that is imported; got {name!r}. Packages are "
-            "imported by --gym-packages"
+            f"{entry} must be the name of a {root.__name__} in a package that is imported; got {name!r}. Use "
+            "--gym-packages to import packages"
         )

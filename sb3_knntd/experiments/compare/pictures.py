@@ -1,4 +1,4 @@
-"""Pictures of a comparison: each draws what it is given."""
+"""Plots of a comparison."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from sb3_knntd.plots import LINE_COLOR, new_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Of each picture, inches. They are shown as wide as a telephone, or two beside each other.
+#: Size of each plot, inches: one column on a phone, two on larger screens.
 SIZE = 4.9, 3.5
 FLOOR_COLOR = "0.55"
-#: Okabe and Ito's colours, which the colour-blind can tell apart.
+#: Colours that are distinguishable with colour blindness (Okabe and Ito).
 COLORS = ("#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#4d4d00")
 
 
 def colors(algos: Sequence[str]) -> dict[str, str]:
     """
     :param algos: names of all algorithms of the comparison
-    :return: a colour for each: one for this project's, grey for the floor
+    :return: a colour for each algorithm: one for all of this package's, grey for random actions
     """
     fixed = {**{algo: LINE_COLOR for algo in algos if is_own(algo)}, FLOOR: FLOOR_COLOR}
     others = [algo for algo in algos if algo not in fixed]
@@ -58,17 +58,17 @@ def _draw_line(axes: Axes, x: np.ndarray, line: Estimate, algo: str, color: str,
 
 
 def _add_legend(figure: Figure, axes: Axes) -> None:
-    # Outside, where it hides nothing.
+    # Outside the axes, to hide no curve.
     handles, names = axes.get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False, fontsize="small")
 
 
 def draw_curves(task: Task, lines: Mapping[str, Estimate], palette: Mapping[str, str], against_time: bool) -> Figure:
     """
-    :param task: the environment
-    :param lines: by algorithm, mean returns at each point
-    :param palette: by algorithm, its colour
-    :param against_time: whether the horizontal axis is seconds of learning, medians over seeds, and not steps
+    :param task: the environment and its runs
+    :param lines: mean returns at each point by algorithm
+    :param palette: colours by algorithm
+    :param against_time: whether the horizontal axis shows seconds of learning (medians over seeds) instead of steps
     :return: learning curves
     """
     figure, axes = _new_axes()
@@ -90,10 +90,10 @@ def draw_curves(task: Task, lines: Mapping[str, Estimate], palette: Mapping[str,
 
 def draw_efficiency(shares: np.ndarray, lines: Mapping[str, Estimate], palette: Mapping[str, str]) -> Figure:
     """
-    :param shares: points, as shares of the training, shape (n_points,)
-    :param lines: by algorithm, normalised scores at each point
-    :param palette: by algorithm, its colour
-    :return: scores against the share of the training
+    :param shares: evaluation points as shares of the training, shape (n_points,)
+    :param lines: normalised scores at each point by algorithm
+    :param palette: colours by algorithm
+    :return: plot of the scores against the share of the training
     """
     figure, axes = _new_axes()
     for algo, line in lines.items():
@@ -107,9 +107,9 @@ def draw_efficiency(shares: np.ndarray, lines: Mapping[str, Estimate], palette: 
 def draw_profiles(thresholds: np.ndarray, lines: Mapping[str, Estimate], palette: Mapping[str, str]) -> Figure:
     """
     :param thresholds: scores, shape (n,)
-    :param lines: by algorithm, share of runs above each
-    :param palette: by algorithm, its colour
-    :return: performance profiles
+    :param lines: share of runs above each score by algorithm
+    :param palette: colours by algorithm
+    :return: plot of the performance profiles
     """
     figure, axes = _new_axes()
     for algo, line in lines.items():
@@ -122,9 +122,9 @@ def draw_profiles(thresholds: np.ndarray, lines: Mapping[str, Estimate], palette
 
 def draw_aggregates(estimates: Mapping[str, Estimate], palette: Mapping[str, str]) -> Figure:
     """
-    :param estimates: by algorithm, those of :data:`~sb3_knntd.experiments.compare.statistics.AGGREGATES`
-    :param palette: by algorithm, its colour
-    :return: a panel for each, with intervals
+    :param estimates: the :data:`~sb3_knntd.experiments.compare.statistics.AGGREGATES` by algorithm
+    :param palette: colours by algorithm
+    :return: plot with one panel per aggregate, with intervals
     """
     figure = new_figure(SIZE[0], 1.0 + 0.32 * len(estimates))
     panels = figure.subplots(1, len(AGGREGATES), sharey=True)
@@ -148,9 +148,9 @@ def draw_aggregates(estimates: Mapping[str, Estimate], palette: Mapping[str, str
 
 def draw_improvements(estimates: Mapping[tuple[str, str], Estimate], palette: Mapping[str, str]) -> Figure:
     """
-    :param estimates: by pair, the probability that the first is better
-    :param palette: by algorithm, its colour
-    :return: probabilities, with intervals
+    :param estimates: by pair of algorithms, the probability that the first is better
+    :param palette: colours by algorithm
+    :return: plot of the probabilities with intervals
     """
     figure, axes = _new_axes(1.0 + 0.36 * len(estimates))
     for row, ((_, second), (value, low, high)) in enumerate(estimates.items()):

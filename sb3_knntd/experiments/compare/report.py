@@ -1,4 +1,4 @@
-"""The report of a comparison: tables, pictures and the files behind them. The words are in ``report.html``."""
+"""The report of a comparison: tables, plots and data files. The text is in the template ``report.html``."""
 
 from __future__ import annotations
 
@@ -41,9 +41,11 @@ from sb3_knntd.plots import DPI
 
 class Column(NamedTuple):
     """
+    A column of the table of an environment.
+
     :param name: heading
-    :param key: of the row's value
-    :param form: how a number is written
+    :param key: key of the value in a row
+    :param form: format of the numbers
     """
 
     name: str
@@ -73,8 +75,8 @@ THRESHOLD_KEYS = ("reached", "steps_to_threshold", "seconds_to_threshold")
 
 def make_report(comparison: Comparison) -> dict[str, bytes]:
     """
-    :param comparison: what to report on
-    :return: by name, the files: the page, the tables behind it as CSV and JSON, and the pictures
+    :param comparison: the comparison to report
+    :return: contents of the files by name: the page, its data as CSV and JSON, and the plots
     """
     contents: dict[str, bytes] = {}
     rows = {task.env: task_rows(task) for task in comparison.tasks}
@@ -92,7 +94,7 @@ def _page(
     statistics: Sequence[GroupStatistics],
     contents: dict[str, bytes],
 ) -> str:
-    """The page, whose words are in ``report.html``; its pictures are added to the contents."""
+    """Render the page from ``report.html``, and add its plots to the contents."""
     algos = list(dict.fromkeys(algo for task in comparison.tasks for algo in task.runs))
     palette = colors(algos)
     results = [run.result for task in comparison.tasks for runs in task.runs.values() for run in runs]
@@ -178,12 +180,12 @@ def _group_view(
 def _store_pictures(
     prefix: str, figures: Mapping[str, Figure], contents: dict[str, bytes]
 ) -> dict[str, dict[str, Any]]:
-    """Adds pictures to the contents as PNG, and returns each as SVG in an address that needs no network."""
+    """Add plots to the contents as PNG, and return each as an SVG data URI."""
     stored = {}
     for name, figure in figures.items():
         png, svg = io.BytesIO(), io.BytesIO()
         figure.savefig(png, format="png")
-        # The same results give the same bytes.
+        # The output is reproducible byte for byte.
         with matplotlib.rc_context({"svg.hashsalt": f"{prefix}-{name}", "path.simplify": True}):
             figure.savefig(svg, format="svg", metadata={"Date": None})
         contents[f"images/{prefix}-{name}.png"] = png.getvalue()
@@ -243,7 +245,7 @@ def _curves_csv(tasks: Sequence[Task]) -> bytes:
 def _json(
     comparison: Comparison, rows: Mapping[str, Sequence[dict[str, Any]]], statistics: Sequence[GroupStatistics]
 ) -> dict[str, Any]:
-    """Numbers that JSON does not have are null: a threshold that is unknown or was never reached."""
+    """The data as JSON; infinite and missing values (thresholds that are unknown or were not reached) become null."""
 
     def plain(value: Any) -> Any:
         return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""The results of a comparison, and the figures that need no resampling."""
+"""The results of a comparison, and statistics that need no resampling."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from sb3_knntd.experiments.compare.configurations import FLOOR, Configuration
 
 class Run(NamedTuple):
     """
-    The result of one seed.
+    The result of one run.
 
-    :param env: environment
+    :param env: id of the environment
     :param algo: name of the algorithm
-    :param seed: its seed
-    :param result: what :func:`sb3_knntd.experiments.compare.run.run` returned
+    :param seed: seed of the run
+    :param result: return value of :func:`sb3_knntd.experiments.compare.run.run`
     """
 
     env: str
@@ -38,13 +38,13 @@ class Run(NamedTuple):
 
     @property
     def cpu_share(self) -> float:
-        """Share of the time of learning in which a core was at work for it; less than 1 on a busy machine."""
+        """CPU time divided by wall-clock time of learning; less than 1 on a busy machine."""
         return float(self.result["cpu_seconds"] / self.result["seconds"][-1])
 
     def cost_to(self, threshold: float) -> tuple[float, float]:
         """
         :param threshold: mean return
-        :return: steps and seconds of learning up to the first evaluation that reached it, infinite if none did
+        :return: steps and seconds of learning until the first evaluation that reached it, infinite if none did
         """
         for steps, seconds, mean in zip(
             self.result["steps"], self.result["seconds"], self.result["returns"], strict=True
@@ -56,11 +56,11 @@ class Run(NamedTuple):
 
 class Task(NamedTuple):
     """
-    An environment, and everything that was run on it.
+    An environment and its runs.
 
-    :param env: environment
-    :param runs: by algorithm, one a seed; no algorithm without any
-    :param threshold: mean return that counts as having learned it, ``None`` if unknown
+    :param env: id of the environment
+    :param runs: by algorithm, one run per seed; at least one for each algorithm
+    :param threshold: mean return that counts as solved, ``None`` if unknown
     """
 
     env: str
@@ -83,36 +83,36 @@ class Task(NamedTuple):
 
     def steps(self) -> np.ndarray:
         """
-        :return: environment steps at each point, those of a single environment, shape (n_points,)
+        :return: environment steps at each evaluation point, shape (n_points,)
         """
         return np.array(self.runs[FLOOR][0].result["steps"])
 
     @property
     def floor(self) -> float:
-        """Mean return of acting at random; a normalised score of 0."""
+        """Mean return of random actions, which has a normalised score of 0."""
         return float(self.returns(FLOOR).mean())
 
     @property
     def top(self) -> float:
-        """A normalised score of 1: the threshold, or without one the best algorithm's mean return at the end."""
+        """Return with a normalised score of 1: the threshold, or without one the best final mean return."""
         best = max(float(self.returns(algo)[:, -1].mean()) for algo in self.runs)
         return self.threshold if self.threshold is not None and self.threshold > self.floor else best
 
     def scores(self, algo: str) -> np.ndarray:
         """
         :param algo: name of an algorithm
-        :return: mean returns, normalised, shape (n_runs, n_points)
+        :return: normalised mean returns, shape (n_runs, n_points)
         """
         span = self.top - self.floor
-        # If no algorithm is better than acting at random, all scores are 0.
+        # If no algorithm is better than random actions, all scores are 0.
         return (self.returns(algo) - self.floor) / span if span > 0 else np.zeros_like(self.returns(algo))
 
 
 class Group(NamedTuple):
     """
-    Environments on which the same algorithms were run, over which averages mean something.
+    Environments on which the same algorithms were run, so that their scores can be aggregated.
 
-    :param tasks: the environments
+    :param tasks: the environments and their runs
     :param algos: names of the algorithms
     """
 
@@ -122,8 +122,7 @@ class Group(NamedTuple):
     def scores(self, algo: str) -> np.ndarray:
         """
         :param algo: name of an algorithm
-        :return: normalised scores of the seeds that succeeded on every environment, shape
-            (n_runs, n_tasks, n_points)
+        :return: normalised scores of the seeds that finished on every environment, shape (n_runs, n_tasks, n_points)
         """
         by_seed = [
             {run.seed: scores for run, scores in zip(task.runs[algo], task.scores(algo), strict=True)}
@@ -135,8 +134,8 @@ class Group(NamedTuple):
 
 def make_groups(tasks: Sequence[Task]) -> list[Group]:
     """
-    :param tasks: environments
-    :return: the same, those with the same algorithms together
+    :param tasks: environments and their runs
+    :return: the tasks grouped by their algorithms
     """
     algos = {task.env: tuple(task.runs) for task in tasks}
     return [Group([task for task in tasks if algos[task.env] == same], same) for same in dict.fromkeys(algos.values())]
@@ -144,18 +143,18 @@ def make_groups(tasks: Sequence[Task]) -> list[Group]:
 
 class Comparison(NamedTuple):
     """
-    All that a report shows.
+    The content of a report.
 
-    :param tasks: environments with their runs
-    :param groups: those with the same algorithms together
-    :param configurations: by environment and algorithm
-    :param command: the command line that computed it
-    :param seeds: of the runs
-    :param steps: of each run
-    :param eval_points: evaluations of each run
-    :param eval_episodes: episodes of each evaluation
-    :param failures: by name of a failed run, its error
-    :param notes: further remarks for the reader
+    :param tasks: environments and their runs
+    :param groups: the tasks grouped by their algorithms
+    :param configurations: configurations by environment and algorithm
+    :param command: the command line that reproduces the results
+    :param seeds: seeds of the runs
+    :param steps: environment steps per run
+    :param eval_points: evaluations per run
+    :param eval_episodes: episodes per evaluation
+    :param failures: error messages by name of the failed run
+    :param notes: further notes for the reader
     """
 
     tasks: Sequence[Task]

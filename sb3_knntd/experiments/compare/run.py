@@ -1,4 +1,4 @@
-"""One run: an algorithm learns an environment with one seed, and is measured while it does."""
+"""One run: train an algorithm on an environment with one seed, and measure it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from sb3_knntd.distributed.jobs import stored_as
 from sb3_knntd.experiments.compare.experiment import experiment, prepare
 from sb3_knntd.experiments.compare.machine import machine, peak_memory, versions
 
-#: Before the clock starts another model of the same configuration learns for so many steps, or so many seconds: what is
-#: compiled or loaded at its first use is then there. KNNTD may begin to learn after 1000 steps.
+#: Before the measurement another model of the same configuration is trained for this many steps or seconds, so that
+#: everything is compiled and loaded. KNNTD may start to learn only after 1000 steps.
 WARM_UP_STEPS = 1100
 WARM_UP_SECONDS = 10.0
 
@@ -37,20 +37,20 @@ def run(
     packages: Sequence[str] = (),
 ) -> dict[str, Any]:
     """
-    Learn, and measure. Meant for a process of its own: that is what its memory is of.
+    Train and measure. Call it in a separate process, because memory is measured per process.
 
-    :param env: environment
+    :param env: id of the environment
     :param algo: name of the algorithm
     :param seed: seed of the model and its environments
-    :param steps: environment steps, over all environments of the configuration together
-    :param hyperparams: its configuration, in RL Zoo's form
-    :param eval_points: how often it is evaluated, equally spaced, the last time after the last step
-    :param eval_episodes: greedy episodes of each evaluation, in environments of their own, whose starts are the same
-        at every point and for every algorithm
+    :param steps: number of environment steps, of all environments of the configuration together
+    :param hyperparams: configuration in RL Zoo's format
+    :param eval_points: number of evaluations, equally spaced, the last one after the last step
+    :param eval_episodes: greedy episodes per evaluation, in separate environments with the same initial states at every
+        point and for every algorithm
     :param packages: modules that register environments
-    :return: at each point ``steps``, mean ``returns`` and ``stds`` of the episodes, and ``seconds`` of learning so far
-        (evaluation apart); ``cpu_seconds`` of learning; ``start_seconds`` from building the model to having made its
-        first steps; ``base_memory`` before and ``peak_memory`` after, and ``model_size`` as a saved file, bytes;
+    :return: at each evaluation ``steps``, mean ``returns`` and ``stds`` of the episodes, and ``seconds`` of learning so
+        far (without evaluation); ``cpu_seconds`` of learning; ``start_seconds`` from building the model to its first
+        steps; ``base_memory`` before and ``peak_memory`` after, and ``model_size`` of the saved file, bytes;
         ``versions`` and ``machine``
     """
     th.set_num_threads(1)
@@ -83,8 +83,8 @@ def run(
 
 def is_result(result: Any) -> bool:
     """
-    :param result: what a file says
-    :return: whether :func:`run` can have returned it
+    :param result: content of a result file
+    :return: whether it has the format of :func:`run`
     """
     try:
         points = [result[name] for name in ("steps", "returns", "stds", "seconds")]
@@ -103,8 +103,8 @@ def is_result(result: Any) -> bool:
 
 def saved_size(model: BaseAlgorithm) -> int:
     """
-    :param model: any
-    :return: size of the file that it is saved to, bytes
+    :param model: a model
+    :return: size of its saved file, bytes
     """
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.zip"
@@ -113,7 +113,7 @@ def saved_size(model: BaseAlgorithm) -> int:
 
 
 class WarmUp(BaseCallback):
-    """Stops learning as soon as what comes later would be like what was."""
+    """Stops training when everything is compiled and loaded."""
 
     def _on_training_start(self) -> None:
         self._end = time.perf_counter() + WARM_UP_SECONDS
@@ -124,20 +124,20 @@ class WarmUp(BaseCallback):
 
 class Recorder(BaseCallback):
     """
-    Evaluates at equally spaced points with the clock stopped, and ends learning at the last one.
+    Evaluates at equally spaced points with the clock stopped, and stops training at the last one.
 
-    :param env: environments for evaluation, with the wrappers of those that are learned from
-    :param total_steps: the last point
-    :param n_points: number of points
-    :param n_episodes: episodes of each evaluation
-    :param seed: of the run, which the starts of the episodes follow from
+    :param env: evaluation environments, with the wrappers of the training environments
+    :param total_steps: the last evaluation point
+    :param n_points: number of evaluation points
+    :param n_episodes: episodes per evaluation
+    :param seed: seed of the run, which determines the initial states of the episodes
     """
 
     def __init__(self, env: VecEnv, total_steps: int, n_points: int, n_episodes: int, seed: int) -> None:
         super().__init__()
         self._env = env
         self._total_steps, self._n_points, self._n_episodes = total_steps, n_points, n_episodes
-        # Below 2^30, so that adding the number of the environment stays within what seeds may be.
+        # Below 2^30, so that seed plus environment index is a valid seed.
         self._seed = int(np.random.SeedSequence(seed).generate_state(1)[0] >> 2)
         self.steps: list[int] = []
         self.returns: list[float] = []
@@ -154,7 +154,7 @@ class Recorder(BaseCallback):
             return True
         self._elapsed += time.perf_counter() - self._since
         self.cpu_seconds += time.process_time() - self._cpu_since
-        # Environments in step can pass several points at once.
+        # A step of several environments can pass several points at once.
         while self._is_due():
             self._evaluate()
         self._start_clock()

@@ -1,6 +1,4 @@
-"""
-Point estimates and 95 % intervals over seeds, by rliable's stratified bootstrap (Agarwal et al., NeurIPS 2021).
-"""
+"""Point estimates and 95 % intervals over seeds, by rliable's stratified bootstrap (Agarwal et al., NeurIPS 2021)."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ from scipy.stats import trim_mean
 from sb3_knntd.experiments.compare.configurations import is_own
 from sb3_knntd.experiments.compare.results import Group, Task
 
-#: Resamples of a bootstrap.
+#: Number of bootstrap resamples.
 REPETITIONS = 2000
 #: Bytes in a megabyte and in a kilobyte.
 MB, KB = 1e6, 1e3
@@ -34,11 +32,11 @@ AGGREGATES: dict[str, Callable[[np.ndarray], float]] = {
 
 class Estimate(NamedTuple):
     """
-    Point estimates with their intervals, arrays of one shape.
+    Point estimates with their intervals, arrays of the same shape.
 
-    :param value: estimates
-    :param low: lower ends
-    :param high: upper ends
+    :param value: point estimates
+    :param low: lower bounds
+    :param high: upper bounds
     """
 
     value: np.ndarray
@@ -48,7 +46,7 @@ class Estimate(NamedTuple):
 
 @contextmanager
 def fixed_seed() -> Iterator[None]:
-    """Seed NumPy's global generator, from which rliable resamples, so that equal results get equal intervals."""
+    """Seed NumPy's global generator, which rliable uses, so that the intervals are reproducible."""
     state = np.random.get_state()
     np.random.seed(0)
     try:
@@ -59,9 +57,9 @@ def fixed_seed() -> Iterator[None]:
 
 def estimate(scores: Mapping[str, np.ndarray], function: Callable[[np.ndarray], np.ndarray]) -> dict[str, Estimate]:
     """
-    :param scores: by algorithm, shape (n_runs, n_tasks, ...)
-    :param function: from scores of that shape to shape (n,)
-    :return: by algorithm, the value of the function and its interval, shape (n,)
+    :param scores: scores by algorithm, shape (n_runs, n_tasks, ...)
+    :param function: statistic that maps scores of that shape to shape (n,)
+    :return: the statistic and its interval by algorithm, shape (n,)
     """
     with fixed_seed():
         values, intervals = library.get_interval_estimates(dict(scores), function, reps=REPETITIONS)
@@ -70,30 +68,30 @@ def estimate(scores: Mapping[str, np.ndarray], function: Callable[[np.ndarray], 
 
 def curves(scores: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
     """
-    :param scores: by algorithm, shape (n_runs, n_tasks, n_points)
-    :return: by algorithm, the interquartile mean at each point, shape (n_points,)
+    :param scores: scores by algorithm, shape (n_runs, n_tasks, n_points)
+    :return: the interquartile mean at each point by algorithm, shape (n_points,)
     """
     return estimate(scores, _iqm_by_point)
 
 
 def _iqm_by_point(scores: np.ndarray) -> np.ndarray:
-    # metrics.aggregate_iqm of each point, all in one go.
+    # A vectorised metrics.aggregate_iqm.
     return np.asarray(trim_mean(scores.reshape(-1, scores.shape[-1]), 0.25, axis=0))
 
 
 def aggregates(scores: Mapping[str, np.ndarray]) -> dict[str, Estimate]:
     """
-    :param scores: by algorithm, final ones, shape (n_runs, n_tasks)
-    :return: by algorithm, the values of :data:`AGGREGATES`, in their order
+    :param scores: final scores by algorithm, shape (n_runs, n_tasks)
+    :return: the values of :data:`AGGREGATES` by algorithm, in their order
     """
     return estimate(scores, lambda drawn: np.array([function(drawn) for function in AGGREGATES.values()]))
 
 
 def profiles(scores: Mapping[str, np.ndarray], thresholds: np.ndarray) -> dict[str, Estimate]:
     """
-    :param scores: by algorithm, final ones, shape (n_runs, n_tasks)
-    :param thresholds: shape (n,)
-    :return: by algorithm, the share of runs whose score is above each threshold, shape (n,)
+    :param scores: final scores by algorithm, shape (n_runs, n_tasks)
+    :param thresholds: scores, shape (n,)
+    :return: the share of runs with a score above each threshold by algorithm, shape (n,)
     """
     with fixed_seed():
         values, intervals = library.create_performance_profile(dict(scores), thresholds, reps=REPETITIONS)
@@ -102,10 +100,10 @@ def profiles(scores: Mapping[str, np.ndarray], thresholds: np.ndarray) -> dict[s
 
 def improvements(scores: Mapping[str, np.ndarray], firsts: Sequence[str]) -> dict[tuple[str, str], Estimate]:
     """
-    :param scores: by algorithm, final ones, shape (n_runs, n_tasks)
+    :param scores: final scores by algorithm, shape (n_runs, n_tasks)
     :param firsts: the algorithms to compare with all others
-    :return: by pair, the probability that a run of the first has a higher score than one of the second, ties counted
-        half, mean over environments, shape (1,)
+    :return: by pair of algorithms, the probability that a run of the first has a higher score than a run of the second
+        (ties count half), averaged over environments, shape (1,)
     """
     pairs = {
         (first, second): [scores[first], scores[second]] for first in firsts for second in scores if second != first
@@ -122,15 +120,15 @@ def improvements(scores: Mapping[str, np.ndarray], firsts: Sequence[str]) -> dic
 
 
 def _probability_of_improvement(first: np.ndarray, second: np.ndarray) -> float:
-    # metrics.probability_of_improvement is this, by way of a rank test whose p-value is thrown away.
+    # Like metrics.probability_of_improvement, without its rank test.
     differences = first[:, None, :] - second[None, :, :]
     return float(((differences > 0) + 0.5 * (differences == 0)).mean())
 
 
 def task_rows(task: Task) -> list[dict[str, Any]]:
     """
-    :param task: an environment with its runs
-    :return: for each algorithm what was measured, medians over seeds unless the name says otherwise
+    :param task: an environment and its runs
+    :return: one row of statistics per algorithm, medians over seeds unless the name says otherwise
     """
     final = curves({algo: task.returns(algo)[:, None, -1:] for algo in task.runs})
     mean = curves({algo: task.returns(algo).mean(axis=1)[:, None, None] for algo in task.runs})
@@ -166,14 +164,14 @@ def task_rows(task: Task) -> list[dict[str, Any]]:
 
 class GroupStatistics(NamedTuple):
     """
-    Statistics over several environments, of final scores unless the name says otherwise.
+    Statistics over several environments, of final scores unless stated otherwise.
 
-    :param aggregates: by algorithm
-    :param thresholds: scores at which the profiles stand, shape (n,)
-    :param profiles: by algorithm
-    :param improvements: by pair
-    :param shares: points of the curves, as shares of the training, shape (n_points,)
-    :param curves: by algorithm, of scores during training
+    :param aggregates: aggregates by algorithm
+    :param thresholds: scores at which the profiles are evaluated, shape (n,)
+    :param profiles: performance profiles by algorithm
+    :param improvements: probabilities of improvement by pair of algorithms
+    :param shares: evaluation points as shares of the training, shape (n_points,)
+    :param curves: interquartile mean of the scores during training by algorithm
     """
 
     aggregates: Mapping[str, Estimate]
@@ -187,7 +185,7 @@ class GroupStatistics(NamedTuple):
 def group_statistics(group: Group) -> GroupStatistics:
     """
     :param group: environments with the same algorithms
-    :return: their statistics, over all of them together
+    :return: statistics over all of them
     """
     scores = {algo: drawn for algo in group.algos if len(drawn := group.scores(algo))}
     final = {algo: drawn[..., -1] for algo, drawn in scores.items()}

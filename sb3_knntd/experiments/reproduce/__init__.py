@@ -1,4 +1,4 @@
-"""The paper's figures, computed over seeds: one module a figure, and what they share."""
+"""The paper's figures, computed over seeds: one module per figure, and shared helpers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from sb3_knntd.experiments.reproduce.fig6 import FIG6
 from sb3_knntd.experiments.reproduce.fig7 import FIG7
 from sb3_knntd.experiments.reproduce.figure import PaperFigure
 
-#: What ``sb3-knntd reproduce`` knows, by name.
+#: The figures of ``sb3-knntd reproduce`` by name.
 FIGURES: dict[str, PaperFigure] = {figure.name: figure for figure in (FIG3, FIG4, FIG6, FIG7)}
 
 __all__ = ["FIGURES", "PaperFigure"]

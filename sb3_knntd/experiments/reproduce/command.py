@@ -1,4 +1,4 @@
-"""``sb3-knntd reproduce``: from settings and seeds to a table, a picture and a verdict."""
+"""``sb3-knntd reproduce``: compute a figure over seeds and write its tables, plot and verdict."""
 
 from __future__ import annotations
 
@@ -23,15 +23,14 @@ def reproduce(name: str, best: bool, seeds: range, episodes: int | None, out: Pa
     """
     Compute a figure of the paper over seeds, write its files, and print the verdict.
 
-    :param name: of the figure
-    :param best: whether to take this project's best settings, not the paper's
-    :param seeds: of the runs
-    :param episodes: how many to learn from, ``None`` for as many as the settings say
-    :param out: folder; files go to its subfolder ``name/best`` or ``name/paper``
-    :param workers: number of processes, ``None`` for one a core
+    :param name: name of the figure
+    :param best: whether to use this project's best settings instead of the paper's
+    :param seeds: seeds of the runs
+    :param episodes: number of training episodes, ``None`` for that of the settings
+    :param out: output folder; files go to its subfolder ``name/best`` or ``name/paper``
+    :param workers: number of processes, ``None`` for one per core
     :return: exit code: 0, or 1 if a seed failed
-    :raises CommandError: if the figure has no best settings, ``episodes`` are too few, or ``out`` is no folder that can
-        be written to
+    :raises CommandError: if the figure has no best settings, ``episodes`` is too small, or ``out`` cannot be written to
     """
     figure, variant = FIGURES[name], "best" if best else "paper"
     variants = load_settings(name)
@@ -59,8 +58,8 @@ def reproduce(name: str, best: bool, seeds: range, episodes: int | None, out: Pa
     if failed:
         print(next(iter(failed.values())), file=sys.stderr)
         print(
-            f"{len(failed)} of {len(jobs)} failed, {', '.join(failed)}; above, why the first did. Without them there "
-            "are no table, picture and verdict: the same command tries them again.",
+            f"{len(failed)} of {len(jobs)} runs failed: {', '.join(failed)}. The error of the first is above. The "
+            "table, plot and verdict need all runs. Run the same command to try them again.",
             file=sys.stderr,
         )
         return 1

@@ -1,4 +1,4 @@
-"""Learning curves, the steps of each episode: computed, and as table and picture."""
+"""Learning curves (steps per episode): computation, table and plot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @stored_as("sb3_knntd.reproduce.curves.episode_lengths")
 def episode_lengths(algorithm: str, setting: Setting, seed: int) -> list[int]:
     """
-    Learn for as many episodes as the setting says.
+    Train for the number of episodes of the setting.
 
     :param algorithm: ``"knntd"`` or ``"exa"``
     :param setting: an entry of ``paper.yml``
@@ -39,7 +39,7 @@ def episode_lengths(algorithm: str, setting: Setting, seed: int) -> list[int]:
 def curve_tables(results: Results) -> dict[str, Table]:
     """
     :param results: steps of each episode
-    :return: a row for each episode
+    :return: a table with one row per episode
     """
     rows = [
         (algorithm, seed, episode, steps)
@@ -52,10 +52,10 @@ def curve_tables(results: Results) -> dict[str, Table]:
 
 def draw_curves(axes: Axes, curves: np.ndarray, alpha: float = 0.25) -> None:
     """
-    Draw every seed faint, and in each episode their median, bold, and the range between the 10 % and 90 % quantiles.
+    Draw the curve of each seed, their median, and the range between the 10 % and 90 % quantiles.
 
-    :param axes: where to draw
-    :param curves: steps, or another figure, of each episode, shape (n_seeds, n_episodes)
+    :param axes: axes to draw on
+    :param curves: steps, or another value, of each episode, shape (n_seeds, n_episodes)
     :param alpha: opacity of the seeds' lines, in [0, 1]
     """
     episodes = np.arange(1, curves.shape[1] + 1)

@@ -1,4 +1,4 @@
-"""Figure 3: Mountain-Car, how many steps an episode takes."""
+"""Figure 3: Mountain-Car, steps per episode."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from sb3_knntd.plots import BASELINE_COLOR, new_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: "Stabilized from the episode 44 at 105 steps", the figure's caption.
+#: The figure's caption: "Stabilized from the episode 44 at 105 steps".
 CLAIMED_EPISODE = 44
 CLAIMED_STEPS = 105
-#: From (-0.5, 0), by a breadth-first search over sequences of actions.
+#: Length of the shortest episode from (-0.5, 0), found by breadth-first search over action sequences.
 SHORTEST = 102
 
 
 def draw(results: Results, title: str) -> Figure:
     """
     :param results: steps of each episode
-    :param title: of the picture
-    :return: learning curves, and the paper's claim as a line
+    :param title: title of the figure
+    :return: plot of the learning curves and the paper's claim
     """
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -62,11 +62,11 @@ def verdict(results: Results) -> str:
     n_reached = sum(steps <= CLAIMED_STEPS for steps in then)
     n_stable = int((curves[:, CLAIMED_EPISODE - 1 :].max(axis=1) <= CLAIMED_STEPS).sum())
     return (
-        f"Mountain-Car, steps in episode {CLAIMED_EPISODE}: the paper says {CLAIMED_STEPS} from there on. Here, over "
-        f"{seeds_range(results['knntd'])}: median {interval(then)}, in brackets the 10 % and 90 % quantiles; the best "
-        f"seed takes {min(then)}, and the shortest way there is {SHORTEST}. {n_reached} of {len(then)} seeds take "
-        f"{CLAIMED_STEPS} or fewer in episode {CLAIMED_EPISODE}, {n_stable} in all episodes from there to "
-        f"{curves.shape[1]}, where medians lie between {number(medians.min())} and {number(medians.max())}. "
+        f"Mountain-Car, steps in episode {CLAIMED_EPISODE}: the paper reports {CLAIMED_STEPS} from there on. Here, "
+        f"over {seeds_range(results['knntd'])}, the median is {interval(then)} (10 % and 90 % quantiles in brackets). "
+        f"The best seed takes {min(then)} steps; the shortest path takes {SHORTEST}. {n_reached} of {len(then)} seeds "
+        f"take {CLAIMED_STEPS} or fewer in episode {CLAIMED_EPISODE}, {n_stable} in all episodes from there to "
+        f"{curves.shape[1]}, where the medians are between {number(medians.min())} and {number(medians.max())}. "
         f"Median at most {CLAIMED_STEPS}: {yes_no(quantile(then, 0.5) <= CLAIMED_STEPS)}."
     )
 

@@ -1,4 +1,4 @@
-"""Figure 4: the δs filter on the generalised Mountain-Car, and how much noise it takes out while it learns."""
+"""Figure 4: the δs filter on the generalised Mountain-Car, and how much noise it removes while it learns."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ if TYPE_CHECKING:
 
 DIMENSIONS = ("position", "velocity")
 SIGNALS = ("true", "raw", "filtered")
-#: So many of the last episodes tell what is left when the filter has learned.
+#: Number of final episodes over which the error after learning is measured.
 LATE = 20
-#: Most steps of an episode that are drawn: of 1000 no single one could be told.
+#: Largest number of steps drawn of an episode, to keep single steps visible.
 MOST_DRAWN = 120
-#: Of the error that is in observations, a filter that takes out a high amount leaves at most so much.
+#: Largest error, relative to the raw signal, that counts as the removal of a high amount of noise.
 HALF = 0.5
-#: Where the car hits the left wall its velocity jumps to 0: steps before and after that in which estimates feel it.
+#: At the left wall the velocity jumps to 0; this many steps before and after that are affected.
 BEFORE_WALL, AFTER_WALL = 1, 7
-#: Mean of the noise in widths of position and velocity over their noise divider.
+#: Mean of the noise, in units of range / noise divider.
 MEAN_NOISE = NOISE_SHAPE[0] / sum(NOISE_SHAPE) - 0.5
 
 
 class SignalRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """
-    Records of each episode the true, the raw and the filtered signal.
+    Records the true, the raw and the filtered signal of each episode.
 
-    The raw and the filtered one without what is the same in every observation of the problem, its offset and the mean
-    of its noise: an error that no filter can know of.
+    The constant error of the problem, its offset and the mean of its noise, is subtracted from the raw and the filtered
+    signal, because no filter can detect it.
 
-    :param env: the filter, around the generalised Mountain-Car
+    :param env: the filter around the generalised Mountain-Car
     """
 
     def __init__(self, env: DeltaFilter) -> None:
         super().__init__(env)
-        #: The signals in the order of ``SIGNALS``, of each episode, of each observation: shape (3, 2).
+        #: For each episode and observation the signals in the order of ``SIGNALS``, shape (3, 2).
         self.episodes: list[list[np.ndarray]] = []
 
     def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
@@ -72,8 +72,8 @@ class SignalRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
 
 def constant_error(env: GeneralizedMountainCarEnv) -> np.ndarray:
     """
-    :param env: the environment; its problem, and what of it is switched on, count
-    :return: how far its observations are off in the mean, shape (2,), observation units
+    :param env: the environment
+    :return: mean error of its observations, with its problem and enabled parts, shape (2,), observation units
     """
     error = np.array(env.parameters.offset) if env.offset else np.zeros(2)
     return error + MEAN_NOISE * np.array(RANGES) / env.parameters.noise_divider if env.noise else error
@@ -82,13 +82,13 @@ def constant_error(env: GeneralizedMountainCarEnv) -> np.ndarray:
 @stored_as("sb3_knntd.reproduce.fig4.filtered_episodes")
 def filtered_episodes(algorithm: str, setting: Setting, seed: int) -> dict[str, Any]:
     """
-    Learn on filtered observations for as many episodes as the setting says, while the filter learns as well.
+    Train on filtered observations for the number of episodes of the setting, while the filter also learns.
 
     :param algorithm: ``"knntd"``
     :param setting: an entry of ``paper.yml``
     :param seed: seed of the model, the environment and its problem
-    :return: of each episode its ``steps`` and the root mean square error of the ``raw`` and the ``filtered`` signal,
-        (n_episodes, 2); ``signals`` of the first and the last one, by their names, each (n_steps + 1, 2)
+    :return: for each episode its ``steps`` and the root mean square error of the ``raw`` and the ``filtered`` signal,
+        shape (n_episodes, 2); the ``signals`` of the first and the last episode by name, each of shape (n_steps + 1, 2)
     """
     recorders: list[SignalRecorder] = []
 
@@ -99,7 +99,7 @@ def filtered_episodes(algorithm: str, setting: Setting, seed: int) -> dict[str, 
     model = make_model(algorithm, setting, seed, wrap)
     model.learn(total_steps(setting), callback=StopTrainingOnMaxEpisodes(setting["episodes"]))
     (recorder,) = recorders
-    # The vectorised environment has begun another one.
+    # The vectorised environment has already started another episode.
     episodes = [np.array(episode) for episode in recorder.episodes[: setting["episodes"]]]
     errors = np.array([root_mean_square(signals[:, 1:] - signals[:, :1]) for signals in episodes])
     return {
@@ -115,8 +115,8 @@ def filtered_episodes(algorithm: str, setting: Setting, seed: int) -> dict[str, 
 
 def root_mean_square(errors: np.ndarray) -> np.ndarray:
     """
-    :param errors: shape (n, ...)
-    :return: over the first axis, shape (...)
+    :param errors: errors, shape (n, ...)
+    :return: root mean square over the first axis, shape (...)
     """
     root: np.ndarray = np.sqrt(np.square(errors).mean(axis=0))
     return root
@@ -124,8 +124,8 @@ def root_mean_square(errors: np.ndarray) -> np.ndarray:
 
 def ratios(result: dict[str, Any]) -> np.ndarray:
     """
-    :param result: of one seed
-    :return: in each episode the error of the filtered over that of the raw signal, shape (n_episodes, 2)
+    :param result: result of one seed
+    :return: error of the filtered signal divided by that of the raw signal, per episode, shape (n_episodes, 2)
     """
     left: np.ndarray = np.array(result["filtered"]) / result["raw"]
     return left
@@ -133,9 +133,9 @@ def ratios(result: dict[str, Any]) -> np.ndarray:
 
 def late_ratio(result: dict[str, Any]) -> np.ndarray:
     """
-    :param result: of one seed
-    :return: the error of the filtered over that of the raw signal in all observations of the last 20 episodes together,
-        shape (2,)
+    :param result: result of one seed
+    :return: error of the filtered signal divided by that of the raw signal, over all observations of the last 20
+        episodes, shape (2,)
     """
     n_observations = np.array(result["steps"][-LATE:]) + 1
     squares = [
@@ -147,8 +147,8 @@ def late_ratio(result: dict[str, Any]) -> np.ndarray:
 
 def at_wall(signals: dict[str, list[list[float]]]) -> np.ndarray:
     """
-    :param signals: of an episode
-    :return: which observations are from one step before to seven steps after the car stands at the left wall, shape
+    :param signals: signals of an episode
+    :return: mask of the observations from one step before to seven steps after the car is at the left wall, shape
         (n_steps + 1,)
     """
     true = np.array(signals["true"])
@@ -160,9 +160,9 @@ def at_wall(signals: dict[str, list[list[float]]]) -> np.ndarray:
 
 def ratio_off_wall(signals: dict[str, list[list[float]]]) -> np.ndarray:
     """
-    :param signals: of an episode
-    :return: the error of the filtered over that of the raw signal in the observations that are not at the wall, shape
-        (2,)
+    :param signals: signals of an episode
+    :return: error of the filtered signal divided by that of the raw signal, over the observations not at the wall,
+        shape (2,)
     """
     true, raw, filtered = (np.array(signals[name])[~at_wall(signals)] for name in SIGNALS)
     left: np.ndarray = root_mean_square(filtered - true) / root_mean_square(raw - true)
@@ -172,7 +172,7 @@ def ratio_off_wall(signals: dict[str, list[list[float]]]) -> np.ndarray:
 def tables(results: Results) -> dict[str, Table]:
     """
     :param results: errors and signals of each seed
-    :return: a row for each dimension of each episode, and the episodes that are drawn
+    :return: a table with one row per episode and dimension, and the plotted episodes
     """
     errors = [
         (seed, episode, steps, dimension, raw, filtered)
@@ -196,15 +196,15 @@ def tables(results: Results) -> dict[str, Table]:
 
 
 def _first(results: Results) -> tuple[int, dict[str, Any]]:
-    """The seed that is drawn: whichever comes first, so that it is not a chosen one."""
+    """The plotted seed: the first one, to avoid a selected example."""
     return next(iter(results["knntd"].items()))
 
 
 def draw(results: Results, title: str) -> Figure:
     """
     :param results: errors and signals of each seed
-    :param title: of the picture
-    :return: the signals of one seed in its first (A) and its last episode (B), and the errors of all (C)
+    :param title: title of the figure
+    :return: plot of the signals of one seed in its first (A) and last episode (B), and the errors of all seeds (C)
     """
     figure = new_figure(12.5, 6.4)
     seed, result = _first(results)
@@ -259,11 +259,10 @@ def verdict(results: Results) -> str:
     by_seed = results["knntd"]
     n_episodes = len(_first(results)[1]["steps"])
     sentences = [
-        "Generalised Mountain-Car, root mean square error of the filtered over that of the raw signal, over "
-        f"{seeds_range(by_seed)}, each a problem of its own; in brackets are the 10 % and 90 % quantiles. What is the "
-        "same in all observations, the mean of the noise, counts as no error. The paper gives no numbers; it says that "
-        "the filter has not learned in the first episodes, and that in the last ones it takes out a very high amount "
-        "of the noise."
+        "Generalised Mountain-Car, root mean square error of the filtered signal divided by that of the raw signal, "
+        f"over {seeds_range(by_seed)}, each with its own problem; 10 % and 90 % quantiles in brackets. The mean of the "
+        "noise does not count as error. The paper gives no numbers. It says that the filter has not learned in the "
+        "first episodes, and that it removes a very high amount of the noise in the last ones."
     ]
     first = np.array([ratios(result)[0] for result in by_seed.values()])
     late = np.array([late_ratio(result) for result in by_seed.values()])
@@ -272,29 +271,29 @@ def verdict(results: Results) -> str:
         middle, n_less = quantile(after, 0.5), sum(ratio < 1 for ratio in after)
         sentences.append(
             f"{name.capitalize()}: median {interval(before)} in the first episode, {interval(after)} in the last "
-            f"{LATE} of {n_episodes}. Noise is taken out (median below 1; so in {n_less} of {len(after)} seeds): "
+            f"{LATE} of {n_episodes}. Noise is removed (median below 1; true for {n_less} of {len(after)} seeds): "
             f"{yes_no(middle < 1)}; half of it or more: {yes_no(middle <= HALF)}."
         )
     last = [result["signals"]["last"] for result in by_seed.values()]
     off_wall = np.array([ratio_off_wall(signals) for signals in last])
     n_hit = sum(bool(at_wall(signals).any()) for signals in last)
     sentences.append(
-        f"Where the car hits the left wall its velocity jumps to 0. {n_hit} of {len(last)} seeds hit it in the last "
-        f"episode. Without the steps there, from {BEFORE_WALL} before to {AFTER_WALL} after, the medians in that "
+        f"When the car hits the left wall, its velocity jumps to 0. {n_hit} of {len(last)} seeds hit it in the last "
+        f"episode. Without the steps around it, from {BEFORE_WALL} before to {AFTER_WALL} after, the medians in that "
         f"episode are {interval(off_wall[:, 0].tolist())} for the position and {interval(off_wall[:, 1].tolist())} for "
         "the velocity."
     )
     steps = [float(np.mean(result["steps"][-LATE:])) for result in by_seed.values()]
     sentences.append(
-        f"kNN-TD(λ), which learns from what the filter returns, takes {interval(steps)} steps an episode in the mean "
-        f"of the last {LATE}."
+        f"kNN-TD(λ), which learns from the filtered observations, takes {interval(steps)} steps per episode (mean of "
+        f"the last {LATE})."
     )
     return " ".join(sentences)
 
 
 FIG4 = PaperFigure(
     name="fig4",
-    help="Mountain-Car under noise, what the δs filter takes out",
+    help="Mountain-Car with noise, and how much of it the δs filter removes",
     min_episodes=LATE + 1,
     compute=filtered_episodes,
     tables=tables,

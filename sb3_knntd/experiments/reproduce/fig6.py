@@ -1,4 +1,4 @@
-"""Figure 6: cart-pole, how many episodes it takes until the pole stays up."""
+"""Figure 6: cart-pole, episodes until the pole stays up."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ from sb3_knntd.registry import ALGORITHMS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Episodes until the policy is near-optimal, says the paper (section 6.2).
+#: The paper's number of episodes until the policy is near-optimal (section 6.2).
 CLAIMED_EPISODES = {"knntd": 29, "exa": 5}
-#: The pole has stayed up. The environment ends an episode there.
+#: Length of a full episode, the environment's step limit.
 FULL = 1000
-#: Episodes after the first full one that tell whether it was luck.
+#: Number of episodes after the first full one that are checked for stability.
 FOLLOWED = 30
-#: What to ask of most seeds, and of most episodes.
+#: The share of seeds, and of episodes, that counts as most.
 MOST = 0.9
 
 
 class Success(NamedTuple):
     """
-    :param episode: the first of 1000 steps, counted from 1; infinity for never
-    :param share: of the next 30 episodes, how many last 1000 steps, in [0, 1]; 0 for never
+    The first full episode of a seed.
+
+    :param episode: number of the first episode of 1000 steps, counted from 1; infinity if there is none
+    :param share: share of the next 30 episodes that last 1000 steps, in [0, 1]; 0 if there is no full episode
     """
 
     episode: float
@@ -39,8 +41,8 @@ class Success(NamedTuple):
 
 def success(steps: Sequence[int]) -> Success:
     """
-    :param steps: of each episode; the last 30 are there to follow, a first success among them comes too late
-    :return: the first success and what came of it
+    :param steps: steps of each episode; the last 30 only follow a success and are not searched for the first one
+    :return: the first success, and the share of successes after it
     """
     for episode, length in enumerate(steps[:-FOLLOWED], start=1):
         if length >= FULL:
@@ -52,8 +54,8 @@ def success(steps: Sequence[int]) -> Success:
 def draw(results: Results, title: str) -> Figure:
     """
     :param results: steps of each episode
-    :param title: of the picture
-    :return: learning curves of each algorithm, and the paper's claims as lines
+    :param title: title of the figure
+    :return: plot of the learning curves of each algorithm and the paper's claims
     """
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -69,7 +71,7 @@ def draw(results: Results, title: str) -> Figure:
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set(title=ALGORITHMS[algorithm].label, xlabel="episode (log scale)", ylabel="steps the pole stays up")
         axes.label_outer()
-        # Above the axes it covers no curve, wherever they rise.
+        # Outside the axes, to hide no curve.
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False, fontsize="small")
     figure.suptitle(title)
     return figure
@@ -87,13 +89,14 @@ def verdict(results: Results) -> str:
         episodes = [each.episode for each in successes]
         n_never, n_within = episodes.count(math.inf), sum(episode <= 2 * claim for episode in episodes)
         share = float(np.mean([each.share for each in successes]))
+        label = ALGORITHMS[algorithm].label
         sentences.append(
-            f"{ALGORITHMS[algorithm].label}: the paper needs {claim}; here the median is {interval(episodes)}, in "
-            f"brackets the 10 % and 90 % quantiles; {n_never} of {len(episodes)} seeds never get there; of the "
-            f"{FOLLOWED} episodes that follow, {100 * share:.1f} % last {FULL} steps (0 for never). Median at most "
+            f"{label}: the paper needs {claim}; here the median is {interval(episodes)} (10 % and 90 % "
+            f"quantiles in brackets). {n_never} of {len(episodes)} seeds never succeed. Of the next {FOLLOWED} "
+            f"episodes {100 * share:.1f} % last {FULL} steps (0 % for seeds that never succeed). Median at most "
             f"{claim}: {yes_no(quantile(episodes, 0.5) <= claim)}; nine seeds in ten within {2 * claim} "
-            f"({n_within} of {len(episodes)}): {yes_no(n_within >= MOST * len(episodes))}; nine in ten of the "
-            f"episodes that follow: {yes_no(share >= MOST)}."
+            f"({n_within} of {len(episodes)}): {yes_no(n_within >= MOST * len(episodes))}; nine in ten of the next "
+            f"episodes: {yes_no(share >= MOST)}."
         )
     return " ".join(sentences)
 

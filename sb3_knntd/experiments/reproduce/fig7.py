@@ -1,4 +1,4 @@
-"""Figure 7: cart-pole, an episode of continuous actions, and how smooth they are."""
+"""Figure 7: cart-pole, an episode of continuous actions and their smoothness."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Parts of equal width that the range of actions is divided into to tell how much of it is used.
+#: Number of equal intervals of the action range, used to measure how much of it is covered.
 PARTS = 20
 COLORS = {"knntd": BASELINE_COLOR, "exa": LINE_COLOR}
 STATE = ("position", "velocity", "angle", "angular velocity")
@@ -29,7 +29,7 @@ STATE = ("position", "velocity", "angle", "angular velocity")
 
 class FullEpisodeRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """
-    Records the first episode that is ended by the time limit.
+    Records the first episode that reaches the time limit.
 
     :param env: a cart-pole with a time limit
     """
@@ -38,7 +38,7 @@ class FullEpisodeRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
         super().__init__(env)
         #: Number of finished episodes.
         self.n_episodes = 0
-        #: The states before each action and the actions, as shares of the largest force; None until there is one.
+        #: The states and actions (shares of the largest force) of the recorded episode; None before it.
         self.recorded: tuple[list[list[float]], list[float]] | None = None
         self._states: list[list[float]] = []
         self._actions: list[float] = []
@@ -65,13 +65,13 @@ class FullEpisodeRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
 @stored_as("sb3_knntd.reproduce.fig7.first_full_episode")
 def first_full_episode(algorithm: str, setting: Setting, seed: int) -> dict[str, Any]:
     """
-    Learn until an episode lasts as long as it may, or for as many episodes as the setting says.
+    Train until an episode reaches the time limit, or for the number of episodes of the setting.
 
     :param algorithm: ``"knntd"`` or ``"exa"``
     :param setting: an entry of ``paper.yml``
     :param seed: seed of the model and its environment
-    :return: ``episode``, counted from 1, ``None`` if there is none; its ``states`` (n_steps, 4) and ``actions``
-        (n_steps,), shares of the largest force
+    :return: the number of the ``episode``, counted from 1, ``None`` if there is none; its ``states``, shape
+        (n_steps, 4), and ``actions``, shape (n_steps,), shares of the largest force
     """
     recorders: list[FullEpisodeRecorder] = []
 
@@ -82,10 +82,10 @@ def first_full_episode(algorithm: str, setting: Setting, seed: int) -> dict[str,
     model = make_model(algorithm, setting, seed, wrap)
     (recorder,) = recorders
 
-    def go_on(locals_: dict[str, Any], globals_: dict[str, Any]) -> bool:
+    def continue_training(locals_: dict[str, Any], globals_: dict[str, Any]) -> bool:
         return recorder.recorded is None and recorder.n_episodes < setting["episodes"]
 
-    model.learn(total_steps(setting), callback=go_on)
+    model.learn(total_steps(setting), callback=continue_training)
     if recorder.recorded is None:
         return {"episode": None, "states": [], "actions": []}
     states, actions = recorder.recorded
@@ -94,16 +94,16 @@ def first_full_episode(algorithm: str, setting: Setting, seed: int) -> dict[str,
 
 def mean_change(actions: list[float]) -> float:
     """
-    :param actions: of an episode, shares of the largest force, shape (n_steps,)
-    :return: mean of abs(a_t - a_(t-1)): 0 is a constant force, 2 one that jumps from end to end
+    :param actions: actions of an episode, shares of the largest force, shape (n_steps,)
+    :return: mean of abs(a_t - a_(t-1)), from 0 (constant force) to 2 (alternating largest forces)
     """
     return float(np.abs(np.diff(actions)).mean())
 
 
 def used_share(actions: list[float]) -> float:
     """
-    :param actions: of an episode, shares of the largest force, shape (n_steps,)
-    :return: share of the range of actions that they are in, counted in twentieths
+    :param actions: actions of an episode, shares of the largest force, shape (n_steps,)
+    :return: share of 20 equal intervals of the action range that contain an action
     """
     counts, _ = np.histogram(actions, bins=PARTS, range=(-1.0, 1.0))
     return float((counts > 0).mean())
@@ -112,7 +112,7 @@ def used_share(actions: list[float]) -> float:
 def tables(results: Results) -> dict[str, Table]:
     """
     :param results: the first full episode of each seed
-    :return: a row for each seed, and the episodes that are drawn
+    :return: a table with one row per seed, and the plotted episodes
     """
     seeds = [
         (algorithm, seed, result["episode"], *_measures(result))
@@ -142,8 +142,8 @@ def _measures(result: dict[str, Any]) -> tuple[float | None, float | None, int |
 def recorded_actions(results: Results, algorithm: str) -> list[list[float]]:
     """
     :param results: the first full episode of each seed
-    :param algorithm: of which algorithm
-    :return: the actions of each seed that has such an episode
+    :param algorithm: name of the algorithm
+    :return: the actions of each seed that has a full episode
     """
     return [result["actions"] for result in results[algorithm].values() if result["actions"]]
 
@@ -151,8 +151,8 @@ def recorded_actions(results: Results, algorithm: str) -> list[list[float]]:
 def drawn_seed(results: Results, algorithm: str) -> int | None:
     """
     :param results: the first full episode of each seed
-    :param algorithm: of which algorithm
-    :return: the first seed that has one
+    :param algorithm: name of the algorithm
+    :return: the first seed that has a full episode, ``None`` if there is none
     """
     return next((seed for seed, result in results[algorithm].items() if result["actions"]), None)
 
@@ -160,17 +160,18 @@ def drawn_seed(results: Results, algorithm: str) -> int | None:
 def draw(results: Results, title: str) -> Figure:
     """
     :param results: the first full episode of each seed
-    :param title: of the picture
-    :return: the route in the state space (A) and the actions (B) of one episode, and of all how smooth they are
+    :param title: title of the figure
+    :return: plot of the trajectory in the state space (A) and the actions (B) of one episode, and of the smoothness of
+        all
     """
     figure = new_figure(10.5, 6.6)
     grid = figure.add_gridspec(2, 6)
     pole, cart = figure.add_subplot(grid[0, :3]), figure.add_subplot(grid[0, 3:])
     actions, smoothness = figure.add_subplot(grid[1, :4]), figure.add_subplot(grid[1, 4:])
-    _draw_route(pole, results, (2, 3), math.degrees(1.0))
-    pole.set(title="A  route of the pole", xlabel="angle (°)", ylabel="angular velocity (°/s)")
-    _draw_route(cart, results, (0, 1), 1.0)
-    cart.set(title="A  route of the cart", xlabel="position (m)", ylabel="velocity (m/s)")
+    _draw_trajectory(pole, results, (2, 3), math.degrees(1.0))
+    pole.set(title="A  trajectory of the pole", xlabel="angle (°)", ylabel="angular velocity (°/s)")
+    _draw_trajectory(cart, results, (0, 1), 1.0)
+    cart.set(title="A  trajectory of the cart", xlabel="position (m)", ylabel="velocity (m/s)")
     _draw_actions(actions, results)
     _draw_smoothness(smoothness, results)
     for axes in (pole, cart, actions, smoothness):
@@ -180,7 +181,7 @@ def draw(results: Results, title: str) -> Figure:
     return figure
 
 
-def _draw_route(axes: Axes, results: Results, dims: tuple[int, int], scale: float) -> None:
+def _draw_trajectory(axes: Axes, results: Results, dims: tuple[int, int], scale: float) -> None:
     for algorithm in results:
         seed = drawn_seed(results, algorithm)
         if seed is None:
@@ -220,7 +221,7 @@ def _draw_smoothness(axes: Axes, results: Results) -> None:
     names = []
     for place, algorithm in enumerate(results):
         changes = [mean_change(actions) for actions in recorded_actions(results, algorithm)]
-        # Side by side in the order of seeds: dots that coincide would hide each other.
+        # Spread horizontally in the order of the seeds, so that equal values do not hide each other.
         across = place + np.linspace(-0.25, 0.25, len(changes))
         axes.scatter(across, changes, color=COLORS[algorithm], alpha=0.4, linewidths=0)
         if changes:
@@ -229,7 +230,7 @@ def _draw_smoothness(axes: Axes, results: Results) -> None:
             axes.hlines(median, place - 0.35, place + 0.35, color=COLORS[algorithm], linewidth=2.5)
         names.append(f"{ALGORITHMS[algorithm].label}\n{len(changes)} of {len(results[algorithm])} seeds")
     axes.set_xticks(range(len(names)), names)
-    axes.set(title="Smoothness, each seed", ylabel="mean change of action a step", xlim=(-0.6, len(names) - 0.4))
+    axes.set(title="Smoothness, each seed", ylabel="mean change of action per step", xlim=(-0.6, len(names) - 0.4))
     axes.set_ylim(bottom=0)
 
 
@@ -239,18 +240,17 @@ def verdict(results: Results) -> str:
     :return: a paragraph
     """
     sentences = [
-        f"Cart-pole, the first episode that lasts 1000 steps, over {seeds_range(results['exa'])}: how much the action "
-        "changes from one step to the next, in the mean, as a share of the largest force."
+        f"Cart-pole, the first episode that lasts 1000 steps, over {seeds_range(results['exa'])}: mean change of the "
+        "action per step, as a share of the largest force."
     ]
     changes = {}
     for algorithm, by_seed in results.items():
         recorded = recorded_actions(results, algorithm)
         changes[algorithm] = [mean_change(actions) for actions in recorded]
         median = f"median {interval(changes[algorithm])}" if recorded else "none"
-        sentences.append(
-            f"{ALGORITHMS[algorithm].label}: {median}, of the {len(recorded)} of {len(by_seed)} seeds that get there."
-        )
-    sentences.append("In brackets are the 10 % and 90 % quantiles.")
+        label = ALGORITHMS[algorithm].label
+        sentences.append(f"{label}: {median}, over the {len(recorded)} of {len(by_seed)} seeds with such an episode.")
+    sentences.append("The 10 % and 90 % quantiles are in brackets.")
     if all(changes.values()):
         smoother = quantile(changes["exa"], 0.5) < quantile(changes["knntd"], 0.5)
         sentences.append(f"The paper says that Ex⟨a⟩(λ) controls more smoothly. By these medians: {yes_no(smoother)}.")
@@ -260,7 +260,7 @@ def verdict(results: Results) -> str:
         distinct = [len(set(actions)) for actions in recorded]
         sentences.append(
             "The paper says that its actions almost completely cover the range. Here they cover "
-            f"{interval(used)} % of it, counted in twentieths, by {interval(distinct)} different actions."
+            f"{interval(used)} % of 20 equal intervals, with {interval(distinct)} different actions."
         )
     return " ".join(sentences)
 

@@ -1,4 +1,4 @@
-"""What a figure of the paper is, to the command that reproduces it."""
+"""The interface of a figure of the paper."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from sb3_knntd.experiments.reproduce.settings import Setting
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: By algorithm and seed, what ``compute`` of a figure returned.
+#: Return values of a figure's ``compute`` by algorithm and seed.
 Results = Mapping[str, Mapping[int, Any]]
 
 
 class Table(NamedTuple):
     """
+    A table that is written as CSV.
+
     :param header: names of the columns
-    :param rows: as many values each; ``None`` for one that is not there
+    :param rows: one value per column; ``None`` for missing values
     """
 
     header: Sequence[str]
@@ -26,15 +28,15 @@ class Table(NamedTuple):
 
 class PaperFigure(NamedTuple):
     """
-    A figure of the paper. Its settings stand under its name in ``zoo_configs/paper.yml``.
+    A figure of the paper. Its settings are under its name in ``zoo_configs/paper.yml``.
 
-    :param name: what it is called on the command line
-    :param help: what is computed, in a few words
-    :param min_episodes: with fewer it tells nothing
-    :param compute: from algorithm, setting and seed to what JSON can hold, in a process of its own
-    :param tables: from the results to CSV files, by file name
-    :param draw: from the results and a title to a picture
-    :param verdict: from the results to a paragraph, the paper's figures beside ours
+    :param name: name on the command line
+    :param help: help text of the command line
+    :param min_episodes: smallest number of episodes that gives a result
+    :param compute: maps algorithm, setting and seed to a JSON-serializable result, in a separate process
+    :param tables: maps the results to tables by file name
+    :param draw: maps the results and a title to a plot
+    :param verdict: maps the results to a paragraph that compares them with the paper
     """
 
     name: str

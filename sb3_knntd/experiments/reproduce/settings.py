@@ -1,4 +1,4 @@
-"""The settings of the paper's figures, and models made of them."""
+"""The settings of the paper's figures, and models made from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import sb3_knntd.envs  # noqa: F401
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.registry import ALGORITHMS
 
-#: What a setting holds besides arguments of its algorithm.
+#: Entries of a setting that are not arguments of the algorithm.
 OF_THE_EXPERIMENT = ("env", "env_kwargs", "episodes", "filter")
 
 Setting = Mapping[str, Any]
@@ -24,7 +24,7 @@ Setting = Mapping[str, Any]
 def load_settings(figure: str) -> dict[str, dict[str, Setting]]:
     """
     :param figure: name of a figure
-    :return: by variant, ``"paper"`` or ``"best"``, and by algorithm, the settings in ``zoo_configs/paper.yml``
+    :return: the settings in ``zoo_configs/paper.yml`` by variant (``"paper"`` or ``"best"``) and algorithm
     """
     import yaml
 
@@ -41,8 +41,8 @@ def make_model(
     :param algorithm: name of an algorithm of this package
     :param setting: an entry of ``paper.yml``
     :param seed: seed of the model and its environment
-    :param wrap: puts wrappers around the environment
-    :return: the model, to learn for :func:`total_steps`
+    :param wrap: wraps the environment
+    :return: the model, to be trained for :func:`total_steps`
     """
     arguments = {name: value for name, value in setting.items() if name not in OF_THE_EXPERIMENT}
     if isinstance(arguments["points"], Mapping):
@@ -60,7 +60,7 @@ def make_model(
 def total_steps(setting: Setting) -> int:
     """
     :param setting: an entry of ``paper.yml``
-    :return: number of steps in its episodes if none ends before its time
+    :return: number of steps if all episodes reach the time limit
     """
     most = gym.spec(setting["env"]).max_episode_steps
     assert most is not None

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-#: Quantiles that an interval lies between: eight seeds in ten.
+#: Quantiles at the ends of an interval.
 LOW, HIGH = 0.1, 0.9
 
 
 def quantile(values: Iterable[float], share: float) -> float:
     """
-    Like :func:`numpy.quantile`, but with infinite values: what lies between a finite value and infinity is infinity.
+    Like :func:`numpy.quantile`, but with infinite values: interpolating between a finite value and infinity gives
+    infinity.
 
-    :param values: at least one; infinity for what never came
-    :param share: in [0, 1]
-    :return: interpolated between the two nearest values
+    :param values: at least one value; infinity for events that did not occur
+    :param share: quantile in [0, 1]
+    :return: the quantile, interpolated between the two nearest values
     """
     ordered = sorted(values)
     place = share * (len(ordered) - 1)
@@ -25,8 +26,8 @@ def quantile(values: Iterable[float], share: float) -> float:
 
 def number(value: float) -> str:
     """
-    :param value: a number, infinity for what never came
-    :return: at least three digits, or "never"
+    :param value: a number; infinity for an event that did not occur
+    :return: the number with at least three digits, or "never"
     """
     if math.isinf(value):
         return "never"
@@ -35,7 +36,7 @@ def number(value: float) -> str:
 
 def interval(values: Sequence[float]) -> str:
     """
-    :param values: one a seed, infinity for what never came
+    :param values: one value per seed; infinity for events that did not occur
     :return: median and interval, such as "29 [3, never]"
     """
     low, median, high = (number(quantile(values, share)) for share in (LOW, 0.5, HIGH))
@@ -44,8 +45,8 @@ def interval(values: Sequence[float]) -> str:
 
 def seeds_range(seeds: Iterable[int]) -> str:
     """
-    :param seeds: in a row
-    :return: such as "30 seeds (1000 to 1029)"
+    :param seeds: consecutive seeds
+    :return: text such as "30 seeds (1000 to 1029)"
     """
     known = list(seeds)
     return f"{len(known)} seeds ({known[0]} to {known[-1]})" if len(known) > 1 else f"one seed ({known[0]})"
@@ -53,7 +54,7 @@ def seeds_range(seeds: Iterable[int]) -> str:
 
 def yes_no(reached: bool) -> str:
     """
-    :param reached: whether something is so
+    :param reached: whether a criterion is met
     :return: "yes" or "no"
     """
     return "yes" if reached else "no"
