@@ -32,7 +32,8 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!sb3_knntd\b)\w+\..*"),
     (r"py:.*", r"sb3_knntd\.kernels\..*"),
     # Imported for type checkers alone, type variables, and names of types.
-    (r"py:.*", r"Axes|BaseCallback|Figure|Path|VecEnv|GymEnv|MaybeCallback|Schedule|State|Self\w+"),
+    (r"py:.*", r"Axes|BaseCallback|Figure|Path|VecEnv|GymEnv|MaybeCallback|Schedule|State"),
+    (r"py:.*", r"(sb3_knntd\..*\.)?(Self\w+|Function)"),
     (r"py:.*", r"ActionColumns|Exploration|RandomStream"),
 ]
 

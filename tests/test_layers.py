@@ -83,11 +83,26 @@ def test_imports_go_down(module: str) -> None:
             assert HEIGHT[part_of(other)] < HEIGHT[part_of(module)], f"{module} imports {other}, which is above it"
 
 
+@pytest.mark.parametrize("part", ["kernels", "perception", "q_table", "actions", "learners"])
+def test_the_core_does_not_import_sb3(part: str) -> None:
+    for module, path in MODULES.items():
+        if module.startswith(f"sb3_knntd.{part}") and module not in PROGRAMS:
+            assert "stable_baselines3" not in path.read_text(encoding="utf-8"), module
+
+
 def test_no_imports_in_a_circle() -> None:
     try:
         TopologicalSorter({module: imported(module) for module in MODULES}).prepare()
     except CycleError as error:
         pytest.fail(f"imports in a circle: {' <- '.join(error.args[1])}")
+
+
+def test_the_layout_in_contributing_names_every_part() -> None:
+    """A reader finds every part there, and none that is gone."""
+    text = (PACKAGE.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    tree = text.partition("```text\nsb3_knntd/\n")[2].partition("```")[0]
+    named = {line.split()[0].removesuffix("/").removesuffix(".py") for line in tree.splitlines() if line[:2] == "  "}
+    assert named == {*HEIGHT, "zoo_configs"}
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["compare", "--help"], ["reproduce", "--help"], ["demo", "--help"]])

@@ -133,7 +133,7 @@ def test_a_place_that_a_callback_has_set_is_saved(
     loaded = algorithm.load(tmp_path / "model", env=make_venv(lengths=[1000]), force_reset=False)
     np.testing.assert_array_equal(loaded._last_obs, venv.steps[10].observations)  # type: ignore[arg-type]
     # It begins an episode there, and has no action left from where it was.
-    assert loaded._last_actions is None
+    assert not loaded.learner.in_episodes
 
 
 @pytest.mark.parametrize("stop", [False, KeyboardInterrupt])

@@ -1,24 +1,19 @@
-"""Environments on the machines of a Ray cluster, as one VecEnv (extra ``[ray]``)."""
+"""A VecEnv whose environments run on the machines of a Ray cluster (extra ``[ray]``)."""
 
 from __future__ import annotations
 
 import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.env_util import is_wrapped, unwrap_wrapper
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
-from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
 from sb3_knntd.common.checks import check_integer, check_number, shown
-from sb3_knntd.common.files import replace_file
 
 try:
     import ray
@@ -36,11 +31,12 @@ try:
 except ImportError as error:
     raise ImportError("RayVecEnv needs Ray: pip install 'sb3-knntd[ray]'") from error
 
+from sb3_knntd.distributed.env_actor import EnvActor, pack_request
 from sb3_knntd.distributed.ray_jobs import connect
 
-#: Seconds without room in the cluster after which the user is told what is waited for.
+#: Seconds without room in the cluster before a warning says what is missing.
 PATIENCE = 30.0
-#: What Ray says where a process or its machine has gone, or with it what it had answered.
+#: Raised by Ray if a process or its machine has died, or its answer was lost with it.
 DEATHS = (
     RayActorError,
     NodeDiedError,
@@ -49,133 +45,8 @@ DEATHS = (
     OutOfMemoryError,
     ObjectLostError,
 )
-#: Options of Ray's actors that are settled here, or are parameters of their own.
+#: Options of Ray's actors that are fixed here or are parameters of :class:`RayVecEnv`.
 SETTLED = {"num_cpus", "max_restarts", "max_task_retries", "max_concurrency", "name", "lifetime", "get_if_exists"}
-
-
-class EnvActor:
-    """
-    An environment in a process of its own.
-
-    What comes in and goes out is pickled here rather than by Ray, from which arrays come read-only.
-    """
-
-    env: gym.Env[Any, Any]
-
-    def __init__(self) -> None:
-        self.reset_info: dict[str, Any] = {}
-
-    def answer(self, request: bytes) -> bytes:
-        """
-        :param request: a method's name, its arguments and its keyword arguments, pickled
-        :return: what the method returns, pickled
-        """
-        name, args, kwargs = cloudpickle.loads(request)
-        return bytes(cloudpickle.dumps(getattr(self, name)(*args, **kwargs)))
-
-    def begin(self, env_fn: bytes, attributes: Mapping[str, bytes], log: str | None, restarts: int) -> str | None:
-        """
-        Make the environment.
-
-        :param env_fn: what makes it, pickled
-        :param attributes: what to set then, by name, pickled
-        :param log: Monitor's file of the environment that this one takes the place of
-        :param restarts: how often that has happened, with this time
-        :return: Monitor's file of this one, ``None`` if there is none
-        """
-        file = Path(log) if log else None
-        before = file.read_bytes() if file and file.exists() else b""
-        self.env = _patch_env(cloudpickle.loads(env_fn)())
-        if file and before and not file.read_bytes().startswith(before):
-            # The new Monitor has begun the file anew. SB3's load_results reads this one beside it.
-            stem = file.name.removesuffix(Monitor.EXT)
-            replace_file(file.with_name(f"{stem}before_restart_{restarts}.{Monitor.EXT}"), before)
-        for name, value in attributes.items():
-            self.set_attr(name, cloudpickle.loads(value))
-        monitor = unwrap_wrapper(self.env, Monitor)
-        writer = monitor.results_writer if isinstance(monitor, Monitor) else None
-        return writer.file_handler.name if writer else None
-
-    def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
-        """
-        :return: of the observations and of the actions
-        """
-        return self.env.observation_space, self.env.action_space
-
-    def reset(self, seed: int | None, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: ``None`` to go on with the random numbers as they are
-        :param options: the environment's own
-        :return: the first observation and its info
-        """
-        observation, self.reset_info = self.env.reset(seed=seed, **({"options": options} if options else {}))
-        return observation, self.reset_info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, dict[str, Any], dict[str, Any]]:
-        """
-        Make a step, and begin the next episode if this one is over.
-
-        :param action: the environment's
-        :return: observation, reward, whether the episode is over, info, and info of the last reset
-        """
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        info["TimeLimit.truncated"] = truncated and not terminated
-        done = terminated or truncated
-        if done:
-            info["terminal_observation"] = observation
-            observation, self.reset_info = self.env.reset()
-        return observation, reward, done, info, self.reset_info
-
-    def render(self) -> Any:
-        """
-        :return: what the environment's ``render`` returns
-        """
-        return self.env.render()
-
-    def has_attr(self, name: str) -> bool:
-        """
-        :param name: of an attribute
-        :return: whether the environment or a wrapper has it
-        """
-        try:
-            self.env.get_wrapper_attr(name)
-        except AttributeError:
-            return False
-        return True
-
-    def get_attr(self, name: str) -> Any:
-        """
-        :param name: of an attribute of the environment or a wrapper
-        :return: its value
-        """
-        return self.env.get_wrapper_attr(name)
-
-    def set_attr(self, name: str, value: Any) -> None:
-        """
-        :param name: of an attribute of the outermost wrapper
-        :param value: its new value
-        """
-        setattr(self.env, name, value)
-
-    def env_method(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """
-        :param name: of a method of the environment or a wrapper
-        :param args: its arguments
-        :param kwargs: its keyword arguments
-        :return: what it returns
-        """
-        return self.env.get_wrapper_attr(name)(*args, **kwargs)
-
-    def is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]]) -> bool:
-        """
-        :param wrapper_class: of a wrapper
-        :return: whether one around the environment is of it
-        """
-        return is_wrapped(self.env, wrapper_class)
-
-    def close(self) -> None:
-        """Close the environment."""
-        self.env.close()
 
 
 class RayVecEnv(VecEnv):
@@ -271,9 +142,9 @@ class RayVecEnv(VecEnv):
         self._attributes: list[dict[str, bytes]] = [{} for _ in env_fns]
         self._logs: list[str | None] = [None] * n_envs
         self._last_seeds: list[int | None] = [None] * n_envs
-        # The last observation of each environment that is in an episode.
+        # The last observation of each environment within an episode.
         self._observations: dict[int, Any] = {}
-        # First observation and info of environments that were made anew in an episode, until a step tells of it.
+        # First observation and info of environments that were restarted within an episode, until the next step.
         self._begun_anew: dict[int, tuple[Any, dict[str, Any]]] = {}
         self._steps: list[tuple[int, ray.ObjectRef[bytes]]] = []
         self._actors: dict[int, ActorHandle[Any]] = {}
@@ -292,7 +163,7 @@ class RayVecEnv(VecEnv):
         :param actions: shape (n_envs, *action_shape)
         """
         self._steps = [
-            (index, self._send(index, _pickled("step", action)))
+            (index, self._send(index, pack_request("step", action)))
             for index, action in zip(range(self.num_envs), actions, strict=True)
             if index not in self._begun_anew
         ]
@@ -322,14 +193,15 @@ class RayVecEnv(VecEnv):
         """
         :return: the first observations
         """
-        # Whatever was going on is over.
+        # Drop steps in progress.
         self._steps, self.waiting = [], False
         self._observations, self._begun_anew = {}, {}
         for index, seed in enumerate(self._seeds):
             if seed is not None:
                 self._last_seeds[index] = seed
         results = self._call_each(
-            range(self.num_envs), [_pickled("reset", *given) for given in zip(self._seeds, self._options, strict=True)]
+            range(self.num_envs),
+            [pack_request("reset", *given) for given in zip(self._seeds, self._options, strict=True)],
         )
         observations, reset_infos = zip(*results, strict=True)
         self._observations = dict(enumerate(observations))
@@ -343,10 +215,10 @@ class RayVecEnv(VecEnv):
         if self.closed:
             return
         self.closed = True
-        # Where Ray was shut down there is nobody to close.
+        # After a shutdown of Ray there is nothing left to close.
         if ray.is_initialized():
             try:
-                self._receive([(index, self._send(index, _pickled("close"))) for index in self._actors])
+                self._receive([(index, self._send(index, pack_request("close"))) for index in self._actors])
             finally:
                 self._kill()
 
@@ -412,17 +284,17 @@ class RayVecEnv(VecEnv):
         """
         return self._call(self._targets(indices), "is_wrapped", wrapper_class)
 
-    # ------------------------------------------------------- asking and hearing
+    # ----------------------------------------------------- requests and answers
 
     def _targets(self, indices: VecEnvIndices) -> list[int]:
         # Negative ones count from the end.
         return [range(self.num_envs)[index] for index in self._get_indices(indices)]
 
     def _call(self, targets: Sequence[int], name: str, /, *args: Any, **kwargs: Any) -> list[Any]:
-        return self._call_each(targets, [_pickled(name, *args, **kwargs)] * len(targets))
+        return self._call_each(targets, [pack_request(name, *args, **kwargs)] * len(targets))
 
     def _call_each(self, targets: Sequence[int], requests: Sequence[bytes]) -> list[Any]:
-        """Ask each its own and wait for all; who dies over it is asked again when it is there anew."""
+        """Send a request to each target and wait for all answers; send it again to environments that died over it."""
         answers: list[Any] = [None] * len(targets)
         left = list(range(len(targets)))
         while left:
@@ -437,9 +309,9 @@ class RayVecEnv(VecEnv):
         return self._actors[index].answer.remote(request)
 
     def _receive(self, asked: Sequence[tuple[int, ray.ObjectRef[bytes]]]) -> tuple[list[Any], dict[int, Exception]]:
-        """All answers, ``None`` for those that will not come, and why not, by environment."""
+        """The answers, ``None`` where there is none, and the reason for that by environment."""
         references = [reference for _, reference in asked]
-        # All are waited for, so that none is still busy when one of them raises.
+        # Wait for all, so that none is still busy when one of them raises.
         late = set(ray.wait(references, num_returns=len(references), timeout=self.timeout)[1]) if references else set()
         answers: list[Any] = []
         deaths: dict[int, Exception] = {}
@@ -457,10 +329,10 @@ class RayVecEnv(VecEnv):
             answers.append(answer)
         return answers, deaths
 
-    # ---------------------------------------------------------- life and death
+    # ------------------------------------------------------------------ restarts
 
     def _restart(self, deaths: Mapping[int, Exception]) -> None:
-        """Make those that died anew, until they live."""
+        """Restart the environments that died, until all are alive."""
         while deaths:
             for index, error in deaths.items():
                 self._tell_of_death(index, error)
@@ -482,7 +354,7 @@ class RayVecEnv(VecEnv):
         )
 
     def _start(self, indices: Sequence[int]) -> dict[int, Exception]:
-        """Make environments, and reset those that were in an episode; who died over it, and why."""
+        """Make environments, and reset those that were in an episode; the reasons of deaths, by environment."""
         deaths = self._place(indices)
         living = [index for index in indices if index not in deaths]
         logs, died = self._receive([(index, self._send(index, self._beginning(index))) for index in living])
@@ -492,7 +364,9 @@ class RayVecEnv(VecEnv):
                 self._logs[index] = log
 
         in_episodes = [index for index in living if index not in died and (self.waiting or index in self._observations)]
-        requests = [(index, self._send(index, _pickled("reset", self._next_seed(index), {}))) for index in in_episodes]
+        requests = [
+            (index, self._send(index, pack_request("reset", self._next_seed(index), {}))) for index in in_episodes
+        ]
         firsts, died = self._receive(requests)
         deaths |= died
         for index, first in zip(in_episodes, firsts, strict=True):
@@ -501,10 +375,10 @@ class RayVecEnv(VecEnv):
         return deaths
 
     def _place(self, indices: Iterable[int]) -> dict[int, Exception]:
-        """A new process for each; whose has died at once, and why."""
+        """Start a process for each environment; the reasons of those that died at once, by environment."""
         for index in indices:
             if index in self._actors:
-                # It may live on, out of reach or busy for too long.
+                # The old process may still be alive, unreachable or busy for too long.
                 ray.kill(self._actors[index])
             self._actors[index] = self._actor_class.remote()  # type: ignore[assignment]
         ready: dict[ray.ObjectRef[Any], int] = {self._actors[index].__ray_ready__.remote(): index for index in indices}
@@ -538,22 +412,24 @@ class RayVecEnv(VecEnv):
         )
 
     def _beginning(self, index: int) -> bytes:
-        return _pickled("begin", self._env_fns[index], self._attributes[index], self._logs[index], self.restarts[index])
+        return pack_request(
+            "begin", self._env_fns[index], self._attributes[index], self._logs[index], self.restarts[index]
+        )
 
     def _next_seed(self, index: int) -> int | None:
         seed = self._last_seeds[index]
         if seed is None:
             return None
-        # Not the last one again, or it would live through the same episodes once more.
+        # Another seed than the last one, which would repeat the same episodes.
         return int(np.random.SeedSequence((seed, self.restarts[index])).generate_state(1)[0])
 
     def _cut_off(self, index: int) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
-        """The step of an environment that was made anew."""
+        """The step of an environment that was restarted: it truncates the episode."""
         observation, reset_info = self._begun_anew.pop(index)
         info = {
             "TimeLimit.truncated": True,
             "env_restarted": True,
-            # Nothing was seen of environments that make steps without a reset.
+            # There is no last observation if the environment was stepped without a reset.
             "terminal_observation": self._observations.get(index, observation),
         }
         return observation, 0.0, True, info, reset_info
@@ -562,7 +438,3 @@ class RayVecEnv(VecEnv):
         for actor in self._actors.values():
             ray.kill(actor)
         self._actors = {}
-
-
-def _pickled(name: str, /, *args: Any, **kwargs: Any) -> bytes:
-    return bytes(cloudpickle.dumps((name, args, kwargs)))

@@ -30,7 +30,7 @@ class SearchSpace(NamedTuple):
     """
     What is searched for an algorithm.
 
-    :param sample: from a trial with the :func:`attributes` to arguments of the algorithm
+    :param sample: from a trial with the user attributes that it needs to arguments of the algorithm
     :param convert: from values of a study to arguments as a configuration has them
     """
 
