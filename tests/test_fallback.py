@@ -50,7 +50,7 @@ with warnings.catch_warnings(record=True) as at_import:
     warnings.simplefilter("always")
     import test_fallback as shared
     from sb3_knntd import KNNTD
-from sb3_knntd.learners.base import TorchLearner
+from sb3_knntd.learners import TorchLearner
 import numpy as np
 
 folder = sys.argv[1]
@@ -189,17 +189,16 @@ def test_numba_has_nowhere_to_keep_its_results(tmp_path: pathlib.Path) -> None:
 CACHED = """
 import sys, warnings
 warnings.simplefilter("always")
-import sb3_knntd.kernels.memory as memory
+from sb3_knntd.kernels.traces import find, rehash
 import numpy as np
 slots = np.full((8, 2), -1, np.int64)
-memory.rehash(np.arange(3), 3, slots)
-found = np.empty(4, np.int64)
-memory.find_rows(np.arange(4), slots, found)
-print(found.tolist())
+rehash(np.arange(3), 3, slots)
+found = [int(find(point, slots)) for point in range(4)]
+print(found)
 """
 
 
-def find_rows_with(cache: pathlib.Path) -> str:
+def find_with(cache: pathlib.Path) -> str:
     """What is warned of when a few kernels are compiled with the cache in a folder."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     command = [sys.executable, "-c", CACHED]
@@ -224,7 +223,7 @@ def flip(content: bytes) -> bytes:
 def cache(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """One that has been filled."""
     folder = tmp_path_factory.mktemp("cache")
-    assert "compiled anew" not in find_rows_with(folder)
+    assert "compiled anew" not in find_with(folder)
     return folder
 
 
@@ -241,10 +240,10 @@ def test_a_damaged_cache_is_replaced(
     assert files
     for file in files:
         file.write_bytes(damage(file.read_bytes()))
-    warned = find_rows_with(tmp_path)
+    warned = find_with(tmp_path)
     assert warned.count("RuntimeWarning: the kernels are compiled anew") == 1
     assert "cannot be read" in warned
-    assert "compiled anew" not in find_rows_with(tmp_path), "the next process finds it mended"
+    assert "compiled anew" not in find_with(tmp_path), "the next process finds it mended"
 
 
 def test_a_full_disk_keeps_no_kernel(tmp_path: pathlib.Path) -> None:
@@ -254,7 +253,7 @@ def test_a_full_disk_keeps_no_kernel(tmp_path: pathlib.Path) -> None:
     if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
         pytest.skip("no file system can be mounted here")
     try:
-        warned = find_rows_with(disk)
+        warned = find_with(disk)
     finally:
         subprocess.run(["umount", str(disk)], check=True)
     assert warned.count("RuntimeWarning: the kernels are compiled anew") == 1
@@ -306,7 +305,7 @@ class Waits(TorchFunctionMode):
 def test_torch_operations_wait_once_a_step(device: str, n_envs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model = learn(n_envs=n_envs, device=device, policy_kwargs={"compiled": False}, search="brute")
     counted: list[Counter[str]] = []
-    learn_step = model.learner.learn
+    learn_step = model.learner.step
 
     def counting(*arguments: Any) -> Any:
         with Waits() as waits:
@@ -314,7 +313,7 @@ def test_torch_operations_wait_once_a_step(device: str, n_envs: int, monkeypatch
         counted.append(waits.counts)
         return answer
 
-    monkeypatch.setattr(model.learner, "learn", counting)
+    monkeypatch.setattr(model.learner, "step", counting)
     model.learn(60 * n_envs, log_interval=None)
     assert len(counted) == 60
     # The environments need their actions. On the CPU, where it costs nothing, a look at the errors comes on top.
