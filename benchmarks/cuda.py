@@ -12,9 +12,12 @@ from gymnasium import spaces
 
 from benchmarks.rows import Row
 from sb3_knntd.actions.exploration import EpsilonGreedy
-from sb3_knntd.actions.selection import DiscreteRule
-from sb3_knntd.learners.base import Form, TorchLearner
+from sb3_knntd.actions.selection import MeanValueSelector
+from sb3_knntd.common.random_stream import RandomStream
+from sb3_knntd.kernels.selection import Target
+from sb3_knntd.learners import Rates, TorchLearner, UpdateConfig
 from sb3_knntd.policies import KNNPolicy
+from sb3_knntd.q_table import DenseTable
 
 N_ENVS, POINTS, K = 4096, 1000, 16
 
@@ -49,12 +52,14 @@ def against_copy(repeats: int) -> list[Row]:
     device = th.device("cuda")
     box = spaces.Box(-1.0, 1.0, (2,), np.float32)
     policy = KNNPolicy(box, spaces.Discrete(3), n_neighbors=K, points=POINTS, search="brute").to(device)
-    rule = DiscreteRule("sarsa", EpsilonGreedy(), True)
-    form = Form(0.99, True, False, False)
-    learner = TorchLearner(policy.perceiver, policy.table, rule, N_ENVS, form, one_step=True)  # type: ignore[arg-type]
+    selector = MeanValueSelector(policy.columns, Target.SARSA, EpsilonGreedy(), random_ties=True)
+    config = UpdateConfig(gamma=0.99, normalized=True, accumulating=False, reset_other_actions=False)
+    stream = RandomStream((N_ENVS, 2, selector.n_uniforms))
+    assert isinstance(policy.table, DenseTable)
+    learner = TorchLearner(policy.perceiver, policy.table, selector, stream, N_ENVS, config, one_step=True)
     rng = np.random.default_rng(0)
     observations = rng.uniform(-1, 1, (N_ENVS, 2)).astype(np.float32)
-    learner.begin(observations, rng.random((N_ENVS, 2)), 0.1)
+    learner.begin(observations, 0.1)
     on_device = th.from_numpy(observations).to(device)
 
     block = th.empty(2**28, dtype=th.float64, device=device)
@@ -63,13 +68,13 @@ def against_copy(repeats: int) -> list[Row]:
 
     distances = 2 * N_ENVS * POINTS**2 * 8
     rows = 3 * N_ENVS * K * 3 * 8
-    answers = rng.random(N_ENVS), np.zeros(N_ENVS, bool), [], np.empty(0), rng.random((N_ENVS, 2, 2)), (0.1, 0.0, 0.1)
+    answers = rng.random(N_ENVS), np.zeros(N_ENVS, bool), {}, Rates(0.1, 0.0, 0.1)
     reached = {
         f"perception of {N_ENVS} observations among 10^6 points, device='cuda'": bandwidth(
             lambda: policy.perceiver(on_device), distances, repeats
         ),
         f"a whole step of {N_ENVS} environments, device='cuda'": bandwidth(
-            lambda: learner.learn(observations, *answers), distances + rows, repeats
+            lambda: learner.step(observations, *answers), distances + rows, repeats
         ),
     }
     return [

@@ -329,10 +329,9 @@ def memory(repeats: int, dtype: th.dtype) -> Row:
         tracemalloc.stop()
         table = model.policy.table
         tensor_bytes = sum(buffer.element_size() * buffer.numel() for buffer in table.buffers())
-        live = model.learner.live  # type: ignore[attr-defined]
-        live_bytes = sum(array.nbytes for array in (live.points, live.entries, live.slots))
-        assert live_bytes < numpy_bytes
-        return (tensor_bytes + live_bytes) / (10**6 * 3 * dtype.itemsize)
+        trace_bytes = sum(array.nbytes for array in table.traces.arrays)
+        assert trace_bytes < numpy_bytes
+        return (tensor_bytes + trace_bytes) / (10**6 * 3 * dtype.itemsize)
 
     ratios = [measure() for _ in range(min(repeats, 2))]
     return Row.of(

@@ -25,12 +25,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from toy_envs import GridEnv
 
-from sb3_knntd import KNNTD, policies
-from sb3_knntd.kernels import desk, nearest, perceive, step
-from sb3_knntd.kernels import memory as memory_kernels
-from sb3_knntd.learners.base import TorchLearner
-from sb3_knntd.learners.compiled import CompiledLearner
-from sb3_knntd.q_table import DenseTable, HashedTable
+from sb3_knntd import KNNTD
+from sb3_knntd.kernels import nearest, perceive, selection, state, td, traces
+from sb3_knntd.learners import CompiledLearner, TorchLearner
+from sb3_knntd.q_table import ActiveTraces, DenseTable, HashedTable
 
 
 class Walk(gym.Env[np.ndarray, int]):
@@ -109,9 +107,9 @@ def as_dense(model: KNNTD) -> np.ndarray:
     return rows.copy()
 
 
-def live(model: KNNTD) -> Any:
+def active_traces(model: KNNTD) -> ActiveTraces:
     assert isinstance(model.learner, CompiledLearner)
-    return model.learner.live
+    return model.policy.table.traces
 
 
 # -------------------------------------------------------------------------------------- the hashed table
@@ -265,9 +263,9 @@ def test_a_smaller_table_is_loaded_into_a_larger_one() -> None:
 
 def sizes(model: KNNTD) -> int:
     """Bytes of the table and of the traces."""
-    table, store = model.policy.table, live(model)
+    table, store = model.policy.table, active_traces(model).arrays
     arrays = [array for array in table.arrays() if isinstance(array, np.ndarray)]
-    return sum(array.nbytes for array in [*arrays, store.points, store.entries, store.slots, store.pace])
+    return sum(array.nbytes for array in [*arrays, *store])
 
 
 def test_a_lattice_of_a_trillion_points_learns() -> None:
@@ -361,11 +359,12 @@ class Alive(BaseCallback):
 
     def _on_step(self) -> bool:
         assert isinstance(self.model, KNNTD)
-        store = live(self.model)
-        traces = store.entries[: store.count, :, : store.n_envs] * store.pace[0]
-        self.alive.append(int((traces > 1e-18).any(axis=(1, 2)).sum()))
+        store = active_traces(self.model)
+        entries, clock = store.arrays.active_entries, store.arrays.clock
+        eligibility = entries[: store.count, :, : store.n_envs] * clock[0]
+        self.alive.append(int((eligibility > 1e-18).any(axis=(1, 2)).sum()))
         self.held.append(store.count)
-        self.room.append(len(store.points))
+        self.room.append(store.capacity)
         return True
 
 
@@ -450,7 +449,7 @@ def test_parameters_in_the_middle_of_an_episode(n_envs: int, table: str) -> None
     venv = walks(n_envs, length=150)
     model = make_model(venv, **arguments).learn(77 * n_envs)
     parameters, then = copy.deepcopy(model.get_parameters()), as_dense(model)
-    place, stream, actions = copy.deepcopy(venv), model._stream.state(), model._last_actions
+    place, stream = copy.deepcopy(venv), model._stream.state()
     seen = copy.deepcopy(model._last_obs)
     model.learn(60 * n_envs, reset_num_timesteps=False)
     uninterrupted = as_dense(model)
@@ -460,7 +459,7 @@ def test_parameters_in_the_middle_of_an_episode(n_envs: int, table: str) -> None
     assert not np.array_equal(then, uninterrupted)
     model.set_env(place, force_reset=False)
     model._stream.set_state(stream)
-    model._last_actions, model._last_obs, model.num_timesteps = actions, seen, 77 * n_envs
+    model._last_obs, model.num_timesteps = seen, 77 * n_envs
     model.learn(60 * n_envs, reset_num_timesteps=False)
     np.testing.assert_array_equal(as_dense(model), uninterrupted)
 
@@ -544,17 +543,17 @@ def test_single_precision_is_close() -> None:
 
 
 def dispatchers() -> Iterator[tuple[str, Any]]:
-    for module in (step, memory_kernels, nearest, perceive):
+    for module in (td, traces, selection, nearest, perceive):
         for name, value in vars(module).items():
             if hasattr(value, "py_func") and value.py_func.__module__ == module.__name__:
                 yield name, value
-    for number, kind in enumerate(desk._KINDS):
-        yield f"learn_at {number}", step._learn_at(kind)
+    for number, kind in enumerate(state._KINDS):
+        yield f"learn_at {number}", td._learn_at(kind)
 
 
 def test_kernels_are_cached_and_release_the_lock() -> None:
     kernels = dict(dispatchers())
-    assert {"learn", "begin", "best_entries", "publish", "settle", "nearest_on_lattice"} <= set(kernels)
+    assert {"learn", "begin", "recommend", "write_back", "flush", "nearest_on_lattice"} <= set(kernels)
     for name, kernel in kernels.items():
         assert kernel.targetoptions.get("nogil"), name
         assert type(kernel._cache).__name__ == "FunctionCache", name
@@ -564,13 +563,13 @@ def test_other_threads_run_while_a_kernel_does(monkeypatch: pytest.MonkeyPatch) 
     model = make_model(walks(), points=(200, 200), n_neighbors=9)
     observations = np.random.default_rng(0).uniform(-1.0, 1.0, (40_000, 2)).astype(np.float32)
     # What the kernel is called with, for it alone is looked at: NumPy lets go of the lock now and then, too.
-    kernel, calls = policies.best_entries, []
+    kernel, calls = td.recommend, []
 
     def keep(*arguments: Any) -> None:
         calls.append(arguments)
         kernel(*arguments)
 
-    monkeypatch.setattr(policies, "best_entries", keep)
+    monkeypatch.setattr(td, "recommend", keep)
     model.predict(observations, deterministic=True)
     assert len(calls) == 1
     begun, done, ticks = threading.Event(), threading.Event(), []

@@ -56,13 +56,13 @@ class Traces(ABC):
     @abstractmethod
     def state(self) -> dict[str, Any]:
         """
-        :return: the traces that are not zero, in the form of :class:`~sb3_knntd.q_table.LiveStore`
+        :return: the traces that are not zero, in the form of :class:`~sb3_knntd.q_table.ActiveTraces`
         """
 
     @abstractmethod
     def set_state(self, state: dict[str, Any]) -> None:
         """
-        :param state: of these traces or of a :class:`~sb3_knntd.q_table.LiveStore`, for as many environments
+        :param state: of these traces or of a :class:`~sb3_knntd.q_table.ActiveTraces`, for as many environments
         """
 
 
