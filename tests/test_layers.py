@@ -16,7 +16,7 @@ PACKAGE = Path(sb3_knntd.__file__).parent
 #: From the bottom up. Parts of one line do not import each other.
 LAYERS = (
     ("common",),
-    ("kernels", "envs", "registry", "distributed"),
+    ("kernels", "envs", "registry", "distributed", "online_algorithm"),
     ("perception", "q_table"),
     ("actions",),
     ("learners", "filters"),

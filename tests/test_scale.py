@@ -664,8 +664,8 @@ def test_nothing_is_compiled_after_the_first_step(tmp_path: pathlib.Path) -> Non
     # With nothing on disk yet, so that whatever is compiled later than in the first step is seen to be.
     report = in_a_new_process(NUMBA_CACHE_DIR=str(tmp_path))
     assert report["first"]["one"]["learn"] == [1, 1]
-    for run, state in report["first"].items():
-        later = {name: (before, report["last"][run][name]) for name, before in state.items()}
+    for run, first in report["first"].items():
+        later = {name: (before, report["last"][run][name]) for name, before in first.items()}
         assert not {name: change for name, change in later.items() if change[0] != change[1]}, run
 
 
