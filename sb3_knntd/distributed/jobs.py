@@ -194,7 +194,10 @@ def run_locally(
             while waiting and idle:
                 (job, attempt), worker = waiting.popleft(), idle.pop()
                 with _environment(ONE_THREAD), _interrupts_held():  # a worker starts with its first job
-                    running[worker.submit(compute, job)] = job, attempt, worker
+                    future = worker.submit(compute, job)
+                # The worker alone holds the writing end: if it dies within an answer, reading ends with an error.
+                worker._result_queue._writer.close()  # type: ignore[attr-defined]
+                running[future] = job, attempt, worker
                 yield job, None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, attempt, worker = running.pop(future)
