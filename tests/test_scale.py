@@ -556,7 +556,7 @@ def test_kernels_are_cached_and_release_the_lock() -> None:
     assert {"learn", "begin", "recommend", "write_back", "flush", "nearest_on_lattice"} <= set(kernels)
     for name, kernel in kernels.items():
         assert kernel.targetoptions.get("nogil"), name
-        assert type(kernel._cache).__name__ == "FunctionCache", name
+        assert type(kernel._cache).__name__ == "KernelCache", name
 
 
 def test_other_threads_run_while_a_kernel_does(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,9 +143,7 @@ class TorchLearner(Learner):
         if self.config.normalized:
             corrections = corrections / probabilities.square().sum(dim=1)
         # On an accelerator looking would mean waiting for it.
-        if corrections.is_cpu and not th.isfinite(corrections).all():
-            raise FloatingPointError(DIVERGENCE)
-        before = self.table.values.clone() if corrections.is_cpu and self._may_diverge(corrections) else None
+        before = self._copy_if_large(corrections) if corrections.is_cpu else None
         traces.mark(indices, action_indices, probabilities)
         traces.credit(corrections)
         if before is not None and not self.table.values.abs().max() <= LARGEST_VALUE:
@@ -153,10 +151,14 @@ class TorchLearner(Learner):
             raise FloatingPointError(DIVERGENCE)
         traces.decay(self.config.gamma * rates.trace_decay, over)
 
-    def _may_diverge(self, corrections: th.Tensor) -> bool:
-        """Whether values are so large that a step could take them beyond what is allowed. A trace is below 1e9."""
-        largest = float(self.table.values.abs().max()) + 1e9 * float(corrections.abs().sum())
-        return not largest <= LARGEST_VALUE
+    def _copy_if_large(self, corrections: th.Tensor) -> th.Tensor | None:
+        """The table's values, if they could become larger than is allowed. A trace is below 1e9."""
+        bound = float(self.table.values.abs().max() + 1e9 * corrections.abs().sum())
+        if bound <= LARGEST_VALUE:
+            return None
+        if not th.isfinite(corrections).all():
+            raise FloatingPointError(DIVERGENCE)
+        return self.table.values.clone()
 
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         rates = update_rates(learning_rate, trace_decay)
