@@ -194,16 +194,9 @@ def run_locally(
             while waiting and idle:
                 (job, attempt), worker = waiting.popleft(), idle.pop()
                 with _environment(ONE_THREAD), _interrupts_held():  # a worker starts with its first job
-<<<<<<< HEAD
                     running[worker.submit(compute, job)] = job, attempt, worker
                 # The worker alone has the other end now: if it dies in the middle of an answer, that is its end.
                 worker._result_queue._writer.close()  # type: ignore[attr-defined]
-=======
-                    future = worker.submit(compute, job)
-                # The worker alone holds the writing end: if it dies within an answer, reading ends with an error.
-                worker._result_queue._writer.close()  # type: ignore[attr-defined]
-                running[future] = job, attempt, worker
->>>>>>> layout
                 yield job, None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, attempt, worker = running.pop(future)
