@@ -1,4 +1,4 @@
-"""Environments that a comparison meets in the tests; importing this registers them."""
+"""Environments for the tests of comparisons; importing this module registers them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gymnasium import spaces
 
 class CorridorEnv(gym.Env[np.ndarray, int]):
     """
-    A corridor of ten places: action 1 leads on and 0 back, a step costs 1, and the end is a terminal state.
+    A corridor of ten cells: action 1 moves forward, 0 back, a step costs 1, and the end is terminal.
 
-    :param breaks: whether the twentieth step raises
+    :param breaks: whether the twentieth step raises an error
     """
 
     def __init__(self, breaks: bool = False) -> None:

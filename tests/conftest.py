@@ -1,4 +1,4 @@
-"""What the behaviour tests share: environments in which everything is known, and models small enough to be quick."""
+"""Shared fixtures: deterministic environments, and models small enough to be fast."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from toy_envs import DriftEnv, GridEnv, PushEnv
 import sb3_knntd.envs  # noqa: F401  registers the continuous cart-pole
 from sb3_knntd import KNNTD, ExA
 
-# Every operation here is tiny: more threads only wait for each other, the more so under pytest-xdist.
+# All operations are tiny: more threads only slow the tests down, especially under pytest-xdist.
 th.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True, scope="session")
 def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """SB3's loggers leave a folder for each model: where pytest tidies up."""
+    """Put the log folders of SB3's loggers where pytest removes them."""
     tempfile.tempdir = str(tmp_path_factory.mktemp("temporary"))
 
 
 @pytest.fixture
 def algorithm() -> type[KNNTD | ExA]:
-    """Whose models ``make_model`` makes: a module whose tests hold for both overrides this to run over both."""
+    """The algorithm of ``make_model``. Modules that test both algorithms override it."""
     return KNNTD
 
 
 @pytest.fixture
 def env_cls(algorithm: type[KNNTD | ExA]) -> type[DriftEnv]:
-    """The drifting point with the actions that the algorithm takes."""
+    """The drifting point with actions for the algorithm."""
     return PushEnv if algorithm is ExA else DriftEnv
 
 
 @pytest.fixture
 def mountain_car(algorithm: type[KNNTD | ExA]) -> str:
-    """The id of the mountain car with the actions that the algorithm takes: gymnasium's own, with chance in it."""
+    """The id of gymnasium's Mountain-Car with actions for the algorithm; it has random initial states."""
     return "MountainCarContinuous-v0" if algorithm is ExA else "MountainCar-v0"
 
 
 @pytest.fixture
 def cart_pole(algorithm: type[KNNTD | ExA]) -> str:
-    """The id of the cart-pole with the actions that the algorithm takes: two of its dimensions have no range."""
+    """The id of a cart-pole with actions for the algorithm; two of its observation dimensions are unbounded."""
     return "sb3_knntd/ContinuousCartPole-v0" if algorithm is ExA else "CartPole-v1"
 
 
@@ -61,7 +61,7 @@ def _number_of_move(action: np.ndarray) -> int:
 
 @pytest.fixture
 def make_grid(algorithm: type[KNNTD | ExA]) -> Callable[..., gym.Env[Any, Any]]:
-    """Makes ``make_grid(kind, **episodes)``: the torus of cells with the actions that the algorithm takes."""
+    """A function ``make_grid(kind, **episodes)`` that makes the torus of cells with actions for the algorithm."""
 
     def make(kind: str = "discrete", **episodes: Any) -> gym.Env[Any, Any]:
         env = GridEnv(kind, **episodes)
@@ -79,13 +79,13 @@ def _monitored(env_cls: type[DriftEnv], **kwargs: Any) -> gym.Env[Any, Any]:
 
 @pytest.fixture
 def make_venv(env_cls: type[DriftEnv]) -> Iterator[Callable[..., VecEnv]]:
-    """Makes ``make_venv(n_envs, vec_env_cls)``: drifting points whose episodes have 9, 14 and 6 steps, in turn."""
+    """A function ``make_venv(n_envs, vec_env_cls)``: drifting points with episodes of 9, 14, 6, 9, ... steps."""
     made: list[VecEnv] = []
 
     def make(
         n_envs: int = 1, vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv, **kwargs: Any
     ) -> VecEnv:
-        # An offset each, or all environments would live through the same.
+        # Different offsets, or all environments would be equal.
         made.append(
             vec_env_cls([partial(_monitored, env_cls, offset=0.23 * index, **kwargs) for index in range(n_envs)])
         )
@@ -98,10 +98,10 @@ def make_venv(env_cls: type[DriftEnv]) -> Iterator[Callable[..., VecEnv]]:
 
 @pytest.fixture
 def make_model(algorithm: type[KNNTD | ExA], make_venv: Callable[..., VecEnv]) -> Callable[..., KNNTD | ExA]:
-    """Makes ``make_model(env, **arguments)``: a model with 48 points, by default of one drifting point, seed 0."""
+    """A function ``make_model(env, **arguments)``: a model with 48 points, by default on a drifting point, seed 0."""
 
     def make(env: Any = None, **kwargs: Any) -> KNNTD | ExA:
-        # Named, that no test hangs on a default that may be found better one day.
+        # Given explicitly, so that tests do not depend on defaults, which may change.
         arguments: dict[str, Any] = {
             "points": (8, 6),
             "bounds": (DriftEnv.LOW, DriftEnv.HIGH),
@@ -120,7 +120,7 @@ def make_model(algorithm: type[KNNTD | ExA], make_venv: Callable[..., VecEnv]) -
 
 @pytest.fixture
 def observations() -> np.ndarray:
-    """A hundred places inside and outside of the drifting point's bounds, shape (100, 2)."""
+    """A hundred observations inside and outside the drifting point's bounds, shape (100, 2)."""
     width = DriftEnv.HIGH - DriftEnv.LOW
     places = np.random.default_rng(3).uniform(DriftEnv.LOW - 0.2 * width, DriftEnv.HIGH + 0.2 * width, size=(100, 2))
     return places.astype(np.float32)
@@ -128,7 +128,7 @@ def observations() -> np.ndarray:
 
 @pytest.fixture
 def read_log() -> Callable[[pathlib.Path], list[dict[str, float]]]:
-    """Reads what SB3's CSV logger wrote into a folder: one dict a dump, without what was not logged in it."""
+    """A function that reads the file of SB3's CSV logger: one dict per dump, without missing values."""
 
     def read(folder: pathlib.Path) -> list[dict[str, float]]:
         with open(folder / "progress.csv", newline="") as file:

@@ -1,4 +1,4 @@
-"""Load every mutation of a saved model's tensors and learn from it, in a process that may crash: see test_files.py."""
+"""Load mutations of a saved model's tensors and train with them. Run in a separate process, which may crash."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KINDS: dict[str, tuple[type[KNNTD | ExA], type[DriftEnv], dict[str, Any]]] = {
 
 
 def mutations(value: Any) -> Iterator[Any]:
-    """What somebody might put in the place of a tensor or number."""
+    """Invalid replacements of a tensor or number."""
     yield from (None, "word", -1, 10**12, float("nan"), [], {})
     if not isinstance(value, th.Tensor):
         return
@@ -56,7 +56,7 @@ def mutations(value: Any) -> Iterator[Any]:
 
 
 def mutated(state: Any) -> Iterator[tuple[str, Any]]:
-    """States of which one entry is another, and which."""
+    """States with one replaced entry, and the name of the entry."""
     for name, value in state.items():
         if isinstance(value, dict):
             for inner, changed in mutated(value):
@@ -67,7 +67,7 @@ def mutated(state: Any) -> Iterator[tuple[str, Any]]:
 
 
 def main(kind: str, folder: Path) -> None:
-    """Try all mutations; each either loads and learns, or is a ValueError."""
+    """Try all mutations; each must load and learn, or raise a ValueError."""
     algorithm, env, arguments = KINDS[kind]
     bounds = {} if "bounds" in arguments else {"bounds": (DriftEnv.LOW, DriftEnv.HIGH)}
 
@@ -99,7 +99,7 @@ def main(kind: str, folder: Path) -> None:
             assert th.isfinite(model.policy.q_table).all()
             n_learned += 1
     print(f"{n_refused} refused, {n_learned} learned", flush=True)
-    # What cannot go wrong is no test.
+    # Both outcomes must occur, or the test would be vacuous.
     assert n_refused > 100
     assert n_learned > 10
 

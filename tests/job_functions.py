@@ -1,4 +1,4 @@
-"""What the jobs of the tests compute, importable by the processes that compute it."""
+"""Functions for the jobs of the tests, importable by worker processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sb3_knntd.distributed.jobs import stored_as
 
 @stored_as("job_functions.square")
 def square(number: int, log: str) -> dict[str, Any]:
-    """Leave a line in the log for each time it is computed."""
+    """Append a line to the log at each call."""
     with open(log, "a") as file:
         file.write(f"{number}\n")
     return {"square": number**2, "pair": (number, number)}
@@ -22,7 +22,7 @@ def square(number: int, log: str) -> dict[str, Any]:
 
 @stored_as("job_functions.threads")
 def threads() -> dict[str, Any]:
-    """How many threads libraries take, and who computes."""
+    """The numbers of threads of the libraries, and the process."""
     import torch
 
     return {"torch": torch.get_num_threads(), "openmp": os.environ["OMP_NUM_THREADS"], "process": os.getpid()}
@@ -36,13 +36,13 @@ def fail(what: str) -> None:
 
 @stored_as("job_functions.unstorable")
 def unstorable() -> object:
-    """What JSON cannot hold."""
+    """Return a value that JSON cannot represent."""
     return object()
 
 
 @stored_as("job_functions.die")
 def die(marker: str, times: int) -> str:
-    """Be killed so many times, then return."""
+    """Kill the own process a number of times, then return."""
     path = Path(marker)
     attempts = int(path.read_text()) if path.exists() else 0
     path.write_text(str(attempts + 1))
@@ -53,7 +53,7 @@ def die(marker: str, times: int) -> str:
 
 @stored_as("job_functions.slow")
 def slow(seconds: float, folder: str) -> int:
-    """Tell which process is at it, and take some time."""
+    """Report the process, and sleep."""
     Path(folder, f"started-{os.getpid()}").touch()
     time.sleep(seconds)
     return os.getpid()
@@ -61,7 +61,7 @@ def slow(seconds: float, folder: str) -> int:
 
 @stored_as("job_functions.die_while_answering")
 def die_while_answering(marker: str, times: int) -> str:
-    """Be killed so many times in the middle of a large answer, then return it."""
+    """Kill the own process a number of times while a large result is being sent, then return it."""
     path = Path(marker)
     attempts = int(path.read_text()) if path.exists() else 0
     path.write_text(str(attempts + 1))

@@ -1,4 +1,4 @@
-"""A Ray cluster on the loopback address, to which nodes can be added, and which they can leave."""
+"""A Ray cluster on the loopback address, to which nodes can be added and from which they can be removed."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ NODE: dict[str, Any] = {"node_ip_address": "127.0.0.1", "object_store_memory": 8
 
 @contextmanager
 def loopback_cluster(**node: Any) -> Iterator[Cluster]:
-    """A head that computes nothing, and a node; this process is connected.
+    """A cluster of a head without CPUs and one node; this process is connected to it.
 
     :param node: what the node has, as Ray calls it
     """
-    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # sockets have short names
+    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # socket paths must be short
     head = {**NODE, "num_cpus": 0, "include_dashboard": False}
     with pytest.MonkeyPatch.context() as patch:
-        # All that Ray writes goes there: the cluster's address too, which it writes whatever the head's own folder is.
+        # Ray writes all its files there, including the address of the cluster.
         patch.setenv("RAY_TMPDIR", folder)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        # Where clusters are not meant for several machines, Ray keeps to the loopback address.
+        # Single-machine clusters use the loopback address.
         patch.setattr(ray_constants, "ENABLE_RAY_CLUSTER", False)
         made = Cluster(initialize_head=True, head_node_args=head)
         made.add_node(**NODE, **node)

@@ -1,4 +1,4 @@
-"""Environments that processes elsewhere can import: one that shows what is done to it, and one that dies."""
+"""Environments that other processes can import: one that records what is done to it, and one that dies."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ class ProbeEnv(gym.Env[np.ndarray, np.ndarray]):
         return self.state, {"seed": seed, "options": options, "draw": self.np_random.random()}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        action *= 2  # an environment may do with an action what it likes
+        action *= 2  # environments may modify the action array
         self.steps += 1
         self.state = self.state + action + self.np_random.normal(size=3)
         over = self.steps >= self.length
         ends = over and self.ends == "terminated", over and self.ends == "truncated"
-        # Of a number that DummyVecEnv, too, keeps as it is.
+        # A number that DummyVecEnv does not round.
         return self.state, float(np.float32(self.state.sum())), *ends, {"steps": self.steps}
 
     def render(self) -> np.ndarray:
         return np.full((4, 6, 3), self.length, np.uint8)
 
-    def scaled(self, factor: float, name: float = 0.0) -> float:  # a name that others may have in mind too
+    def scaled(self, factor: float, name: float = 0.0) -> float:  # also the name of an argument of the wrappers
         return factor * self.length + name
 
     def unlucky(self) -> None:
@@ -55,9 +55,9 @@ class ProbeEnv(gym.Env[np.ndarray, np.ndarray]):
 
 class SampleEnv(gym.Env[Any, Any]):
     """
-    Observations drawn from a space.
+    Random observations from a space.
 
-    :param space: of the observations
+    :param space: the observation space
     """
 
     def __init__(self, space: spaces.Space[Any]) -> None:
@@ -77,9 +77,9 @@ class SampleEnv(gym.Env[Any, Any]):
 
 class MortalEnv(gym.Env[np.ndarray, Any]):
     """
-    Counts its steps; its process can be made to die, or to stop answering.
+    Counts its steps; its process can die or stop responding.
 
-    :param length: steps of an episode
+    :param length: steps per episode
     """
 
     def __init__(self, length: int = 10) -> None:

@@ -1,10 +1,9 @@
 """
-Short runs whose tables are kept in ``tests/data/recorded_tables.npz``. A change of structure must not change
-a bit of them.
+Short runs whose tables are stored in ``tests/data/recorded_tables.npz``. Refactoring must not change a bit of them.
 
-Models and a filter that were saved then must still load.
+Models and a filter that were saved at the same time must still load.
 
-``python tests/recorded_runs.py`` records them anew. Do that only where results are meant to change, and say so in the
+``python tests/recorded_runs.py`` records them again. Do this only if results are meant to change, and say so in the
 CHANGELOG.
 """
 
@@ -25,17 +24,17 @@ from sb3_knntd.experiments.baselines.tile_sarsa import TileSarsa
 
 DATA = Path(__file__).parent / "data"
 RECORDED = DATA / "recorded_tables.npz"
-#: What :func:`continued` gives for the files of ``SAVED`` and :func:`filtered` for the filter's.
+#: Results of :func:`continued` for the files of ``SAVED``, and of :func:`filtered` for the filter's file.
 CONTINUED = DATA / "continued_tables.npz"
 
 
 class RationalEnv(EpisodeEnv):
-    """A point on a line, pushed by its action. Its dynamics are sums and products alone, equal on every machine.
+    """A point on a line, pushed by its action. Its dynamics are sums and products only, equal on every machine.
 
     :param n_actions: number of Discrete actions; 0 for a Box
     :param action_dim: number of dimensions of the Box
-    :param bounded: whether the observation space tells the range
-    :param offset: shifts where the episodes start
+    :param bounded: whether the observation space is bounded
+    :param offset: shifts the initial states
     """
 
     def __init__(
@@ -76,7 +75,7 @@ def make_venv(n_envs: int = 1, **arguments: Any) -> VecEnv:
 
 _SCATTERED = (np.arange(120).reshape(60, 2) * [0.61803, 0.41421]) % 1.0 * [4.0, 1.0] - [2.0, 0.5]
 
-#: Of each run: algorithm, what its environments are made with, its arguments.
+#: For each run: algorithm, arguments of its environments, its own arguments.
 RUNS: dict[str, tuple[type[KNNTD | ExA], dict[str, Any], dict[str, Any]]] = {
     "knntd": (KNNTD, {}, {}),
     "knntd_paper": (KNNTD, {}, {"step_size": "paper", "traces": "accumulating", "learning_rate": 0.2}),
@@ -99,11 +98,11 @@ RUNS: dict[str, tuple[type[KNNTD | ExA], dict[str, Any], dict[str, Any]]] = {
     "exa_torch": (ExA, {"n_actions": 0}, {"policy_kwargs": {"compiled": False}}),
 }
 
-#: Those that compute exponentials, whose last bit depends on the machine's library.
+#: Runs that compute exponentials, whose last bit depends on the machine's math library.
 INEXACT = {"knntd_softmax", "knntd_gaussian"}
 
 
-#: The runs of which a model is kept as a file, written by the first version of the format.
+#: The runs with a saved model in the first version of the file format.
 SAVED = ("knntd_4_envs", "knntd_hashed", "exa")
 LENGTHS: dict[str, Any] = {"lengths": (9, 57, 31), "ends": ("terminated", "truncated")}
 FILTER = DATA / "saved_filter.zip"
@@ -111,16 +110,16 @@ FILTER = DATA / "saved_filter.zip"
 
 def saved_file(name: str) -> Path:
     """
-    :param name: of a run in ``SAVED``
-    :return: the file that its model was saved to after 500 steps
+    :param name: name of a run in ``SAVED``
+    :return: the file of its model, saved after 500 steps
     """
     return DATA / f"saved_{name}.zip"
 
 
 def make_model(name: str) -> KNNTD | ExA:
     """
-    :param name: of a run in ``RUNS``
-    :return: its model, which has not learned
+    :param name: name of a run in ``RUNS``
+    :return: its untrained model
     """
     algorithm, environment, arguments = RUNS[name]
     return algorithm(make_venv(**LENGTHS, **environment), **{"points": 9, "seed": 3, **arguments})
@@ -128,8 +127,8 @@ def make_model(name: str) -> KNNTD | ExA:
 
 def table_of(name: str) -> np.ndarray:
     """
-    :param name: of a run in ``RUNS``
-    :return: the table after it, shape (n_rows, n_actions)
+    :param name: name of a run in ``RUNS``
+    :return: the table after the run, shape (n_rows, n_actions)
     """
     table: np.ndarray = make_model(name).learn(1600).policy.q_table.numpy()
     return table
@@ -137,7 +136,7 @@ def table_of(name: str) -> np.ndarray:
 
 def tile_weights() -> np.ndarray:
     """
-    :return: the weights that SARSA(λ) with tile coding ends with, shape (n_actions, n_features)
+    :return: the final weights of SARSA(λ) with tile coding, shape (n_actions, n_features)
     """
     model = TileSarsa("TilePolicy", make_venv(**LENGTHS), n_tiles=5, n_tilings=4, seed=3)
     weights: np.ndarray = model.learn(1600).policy.weights.numpy()
@@ -146,8 +145,8 @@ def tile_weights() -> np.ndarray:
 
 def continued(name: str) -> np.ndarray:
     """
-    :param name: of a run in ``SAVED``
-    :return: the table of the model in its file after 300 further steps, shape (n_rows, n_actions)
+    :param name: name of a run in ``SAVED``
+    :return: the table of its saved model after 300 further steps, shape (n_rows, n_actions)
     """
     algorithm, environment, _ = RUNS[name]
     model = algorithm.load(saved_file(name), env=make_venv(**LENGTHS, **environment))
@@ -158,7 +157,7 @@ def continued(name: str) -> np.ndarray:
 def filtered(venv: VecDeltaFilter) -> np.ndarray:
     """
     :param venv: a filter over one :class:`RationalEnv`
-    :return: what it makes of the observations of 100 steps, shape (100, 2)
+    :return: its estimates in 100 steps, shape (100, 2)
     """
     venv.reset()
     return np.array([venv.step(np.array([step % 3]))[0][0] for step in range(100)])

@@ -1,4 +1,4 @@
-"""`bounds="adaptive"`: the box follows the observations, and what was learned goes with it."""
+"""`bounds="adaptive"`: the bounds follow the observations, and the learned values are kept."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ LEARNERS: dict[str, dict[str, Any]] = {"compiled": {}, "torch": {"compiled": Fal
 
 class Wander(gym.Env[np.ndarray, Any]):
     """
-    A walk that goes farther the longer it is run, seen in two dimensions, of which the second has no bounds; actions
-    are Discrete or a Box.
+    A walk whose range grows with time, with two observation dimensions, of which the second is unbounded; actions are
+    Discrete or a Box.
 
-    :param first: where the random numbers start
+    :param first: offset in the sequence of random numbers
     :param continuous: whether actions are a Box
     """
 
@@ -67,7 +67,7 @@ def make_random(table: str = "dense", points: Any = (9, 7), **arguments: Any) ->
     assert isinstance(model, KNNTD)
     model.policy.perceiver.measure(th.tensor([[-0.5, -2.0], [1.5, 2.0]]))
     if table == "hashed":
-        # All rows, made by hand: there is no other way to visit points of a lattice without learning.
+        # Set all rows directly: without learning there is no other way to visit all points of a lattice.
         everything = th.arange(model.policy.perceiver.points.n_points)
         model.policy.table._refill(everything, th.zeros(len(everything), 3, dtype=th.float64))  # type: ignore[operator]
     values = model.policy.q_table
@@ -83,7 +83,7 @@ def box(model: KNNTD | ExA) -> np.ndarray:
 @pytest.mark.parametrize("table", ["dense", "hashed"])
 @settings(max_examples=40, deadline=None)
 @given(beyond=st.tuples(st.floats(-6.0, 6.0), st.floats(-9.0, 9.0)), seed=st.integers(0, 2**16))
-def test_values_are_kept_to_within_the_interpolation_error(table: str, beyond: tuple[float, float], seed: int) -> None:
+def test_widening_keeps_values_up_to_interpolation_error(table: str, beyond: tuple[float, float], seed: int) -> None:
     model = make_random(table)
     low, high = box(model)
     inside = th.from_numpy(np.random.default_rng(seed).uniform(low, high, (50, 2)))
@@ -92,7 +92,7 @@ def test_values_are_kept_to_within_the_interpolation_error(table: str, beyond: t
     model.policy.widen(th.tensor([beyond]))
     after = model.policy.q_values(inside)
 
-    # What is read now is the old function at the points around, in their mean.
+    # The values are now means of the old function at the neighbouring points.
     now = model.policy.perceive(inside)
     places = model.policy.perceiver.points.coordinates(model.policy.perceiver.bounds, now.indices.flatten())
     places = model.policy.perceiver.bounds.unscale(places)
@@ -101,15 +101,15 @@ def test_values_are_kept_to_within_the_interpolation_error(table: str, beyond: t
         th.testing.assert_close(after, (now.probabilities[..., None] * around).sum(dim=1), rtol=1e-9, atol=1e-9)
         assert ((after - before).abs() <= (around - before[:, None]).abs().amax(dim=1) + 1e-9).all()
     else:
-        # Points that no old one has come to are as if never visited; all others are as in a dense table.
+        # Points without an old point nearby count as not visited; all others are as in a dense table.
         made = model.policy.table.rows(now.indices) != model.initial_value
         th.testing.assert_close(model.policy.table.rows(now.indices)[made], around[made], rtol=1e-9, atol=1e-9)
         assert model.policy.table.n_visited <= old.policy.table.n_visited
 
 
 @pytest.mark.parametrize("weights", ["inverse_quadratic", "gaussian"])
-def test_a_smooth_function_comes_through_many_widenings(weights: str) -> None:
-    """A plane is off by no more than the spacing of the points allows, after ten times."""
+def test_many_widenings_keep_a_smooth_function(weights: str) -> None:
+    """After ten widenings the error of a plane is below the limit given by the point spacing."""
     model = make_random(points=(60, 60), weights=weights, bandwidth=0.02)
     points = model.policy.points
     model.policy.q_table.copy_((2.0 * points[:, :1] - points[:, 1:]).expand(-1, 3))
@@ -161,18 +161,18 @@ def test_scattered_points_stay_where_they_are_and_keep_their_values() -> None:
 
 def test_visited_points_are_those_where_visited_ones_were() -> None:
     model = make_random(points=(40, 40))
-    # The lower half of the first dimension.
+    # Only the lower half of the first dimension was visited.
     model.policy.table.visit(th.arange(800))  # type: ignore[operator]
     model.policy.widen(th.tensor([[5.0, 0.0]]))
     visited = np.unpackbits(model.policy.table.visited.numpy(), bitorder="little")[:1600].astype(bool)  # type: ignore[union-attr]
-    # The bounds were [-1, 2], so that half a spacing more than 0.5 is nearer to the upper half.
+    # The bounds were [-1, 2], so points above 0.5 plus half a spacing are nearer to the upper half.
     np.testing.assert_array_equal(visited, (model.policy.points[:, 0] < 0.5).numpy())
 
 
 @pytest.mark.parametrize("cls", [KNNTD, ExA])
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize("kwargs", [{}, {"compiled": False}, {"table": "hashed"}], ids=["compiled", "torch", "hashed"])
-def test_all_that_is_seen_comes_to_lie_within(
+def test_bounds_contain_all_observations(
     cls: type[KNNTD] | type[ExA], n_envs: int, kwargs: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = make_model(cls, n_envs, policy_kwargs=kwargs, verbose=1)
@@ -248,7 +248,7 @@ def test_normalised_observations_are_followed() -> None:
     assert model.policy.perceiver.sees(np.asarray(last))
 
 
-def test_the_space_is_followed_no_farther_than_it_reaches() -> None:
+def test_bounds_stay_within_the_space() -> None:
     model = KNNTD("MountainCar-v0", bounds="adaptive", seed=0)
     model.learn(5000)
     space = model.observation_space
@@ -256,11 +256,11 @@ def test_the_space_is_followed_no_farther_than_it_reaches() -> None:
     low, high = box(model)
     assert (low >= space.low).all()
     assert (high <= space.high).all()
-    # A random policy sees less than half of the velocities, a better one almost all.
+    # A random policy covers less than half of the velocities, a better one almost all.
     assert high[1] - low[1] > 0.07
 
 
-def test_states_have_no_range_to_follow() -> None:
+def test_finite_states_have_no_adaptive_bounds() -> None:
     with pytest.raises(ValueError, match=r"bounds must be None for a Discrete observation space.*'adaptive'"):
         KNNTD("FrozenLake-v1", bounds="adaptive")
 
@@ -270,8 +270,8 @@ def test_other_words_are_refused() -> None:
         KNNTD("MountainCar-v0", bounds="wide")
 
 
-def test_beyond_the_space_there_is_nothing_to_follow() -> None:
-    """Noise carries observations past the space's bounds; the table is not carried over for that at every step."""
+def test_observations_outside_the_space_do_not_widen_the_bounds() -> None:
+    """Noise moves observations outside the space's bounds; this must not regrid the table at every step."""
     model = make_random()
     model.policy.perceiver.measure(th.tensor([[-40.0, -2.0], [40.0, 2.0]]))
     values = model.policy.q_table.clone()

@@ -1,4 +1,4 @@
-"""Any value may be given for any argument: what is made of it learns, or an error names the argument."""
+"""Every value of every argument either works or raises an error that names the argument."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from sb3_knntd.filters import DeltaFilter, VecDeltaFilter
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
-#: Seconds after which a case counts as hanging: a kernel may have to be compiled in it.
+#: Timeout of a case, seconds; it may have to compile a kernel.
 PATIENCE = 300
-#: Address space that the cases may take beyond what the process has, bytes: less than the least that is refused.
+#: Additional address space for the cases, bytes; less than the smallest size that is refused.
 ROOM = 2**31
 
 NAN, INF = float("nan"), float("inf")
 
-#: What is right somewhere, and wrong elsewhere.
+#: Values that are valid for some arguments and invalid for others.
 VALUES: list[Any] = [
     None, True, False, np.True_, "", "auto", "no", "0.5", "adaptive", "gaussian", "brute", "hashed", "a/b", "a\0b", "é",
     b"", b"0.5", NAN, INF, -INF, 0.5, 1.5, 5.0, 1e-320, 5e-324, 1e-200, 1e30, 1e155, 1e308, -1e308, -0.0, -0.5, 3.0,
@@ -81,7 +81,7 @@ values = st.one_of(
 
 
 class Point(gym.Env[np.ndarray, Any]):
-    """A point in the plane is pushed about, six steps an episode."""
+    """A point in the plane, pushed by actions, with episodes of six steps."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
@@ -134,7 +134,7 @@ def watch(callback: type[Any], arguments: dict[str, Any], **needed: Any) -> None
 
 numbers = itertools.count()
 
-#: What is made with arguments and used, and the names of its arguments.
+#: The tested classes, and the names of their arguments.
 MAKERS: dict[type[Any], Callable[[dict[str, Any]], None]] = {
     KNNTD: lambda arguments: learn(KNNTD, arguments),
     ExA: lambda arguments: learn(ExA, arguments),
@@ -150,9 +150,9 @@ MAKERS: dict[type[Any], Callable[[dict[str, Any]], None]] = {
     ),
     HParamCallback: lambda arguments: watch(HParamCallback, arguments),
 }
-#: What takes most arguments is tried most often.
+#: Classes with more arguments are drawn more often.
 KINDS = [KNNTD] * 6 + [ExA] * 6 + [DeltaFilter] * 3 + [VecDeltaFilter] * 2 + list(MAKERS)[4:]
-#: The environment, whose kinds are other tests' matter, and what is no argument of a user's.
+#: Arguments that are not varied: environments, which other tests cover, and internal arguments.
 LEFT_OUT = {"self", "policy", "env", "venv", "_init_setup_model"}
 
 
@@ -170,8 +170,8 @@ def cases(draw: st.DrawFn) -> tuple[type[Any], dict[str, Any]]:
 
 def check(kind: type[Any], arguments: dict[str, Any]) -> None:
     """
-    It is made and works, or the error is one of the user's and names an argument that was given. Divergence is what
-    comes of a learning rate, which it names.
+    Check that the object can be made and used, or that the error is a user error that names a given argument.
+    Divergence is attributed to the learning rate, which its message names.
     """
     try:
         MAKERS[kind](arguments)
@@ -182,9 +182,9 @@ def check(kind: type[Any], arguments: dict[str, Any]) -> None:
 
 @pytest.fixture
 def confined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """In an empty folder, with little memory to take, and not for ever."""
+    """Run in an empty folder, with a memory limit and a timeout."""
     monkeypatch.chdir(tmp_path)
-    # Compiled once, before memory is short.
+    # Compile once before the memory is limited.
     for kind in (KNNTD, ExA, DeltaFilter):
         MAKERS[kind]({})
     resource = limits = None

@@ -1,4 +1,4 @@
-"""Errors name what is wrong, what it is, and what would do; nothing is spoilt by them."""
+"""Errors name the argument, its value and valid values, and leave the model unchanged."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MakeModel = Callable[..., KNNTD]
 
 NAN, INF = float("nan"), float("inf")
 
-# argument -> values that are refused, with what the message has to say of what would do
+# argument -> refused values, with the part of the message that names valid values
 REFUSED: dict[str, tuple[list[Any], str]] = {
     "learning_rate": (
         [-0.1, NAN, INF, "0.3", True, None, object, lambda: 0.1, lambda progress: progress - 0.7, lambda _: NAN],
@@ -66,7 +66,7 @@ def message_of(make: Callable[[], Any]) -> str:
         for index, value in enumerate(values)
     ],
 )
-def test_argument_value_and_what_would_do_are_named(
+def test_error_names_argument_value_and_valid_values(
     make_model: MakeModel, argument: str, value: Any, fits: str
 ) -> None:
     message = message_of(lambda: make_model(**{argument: value}))
@@ -101,7 +101,7 @@ def test_epsilon_is_checked_where_it_is_not_used(make_model: MakeModel) -> None:
         {"temperature": lambda p: p + 0.1, "exploration": "softmax"}, {"weights": lambda d2: np.ones(d2.shape)},
     ],
 )  # fmt: skip
-def test_what_fits_is_taken(make_model: MakeModel, arguments: dict[str, Any]) -> None:
+def test_valid_arguments_are_accepted(make_model: MakeModel, arguments: dict[str, Any]) -> None:
     table = make_model(**arguments).learn(20).policy.q_table
     assert th.isfinite(table).all()
 
@@ -206,13 +206,13 @@ def test_bounds(make_model: MakeModel, bounds: Any, says: str) -> None:
         (object, "raised TypeError"),
     ],
 )
-def test_weights_that_are_none(make_model: MakeModel, function: Any, says: str) -> None:
+def test_invalid_weights_are_refused(make_model: MakeModel, function: Any, says: str) -> None:
     message = message_of(lambda: make_model(weights=function))
     assert "weights" in message
     assert says in message
 
 
-def test_weights_that_fail_later_spoil_nothing(make_model: MakeModel) -> None:
+def test_weights_that_fail_later_leave_the_model_unchanged(make_model: MakeModel) -> None:
     calls = 0
 
     def weights(d2: th.Tensor) -> th.Tensor:
@@ -237,14 +237,14 @@ def test_there_is_no_network(name: str, env: str | None) -> None:
     assert 'KNNTD("KNNPolicy", env)' in message
 
 
-def test_policies_of_others_are_refused() -> None:
+def test_foreign_policies_are_refused() -> None:
     from stable_baselines3.dqn import MlpPolicy
 
     message = message_of(lambda: KNNTD(MlpPolicy, "MountainCar-v0"))  # type: ignore[arg-type]
     assert "KNNPolicy" in message
 
 
-def test_two_environments_are_one_too_many() -> None:
+def test_two_environments_are_refused() -> None:
     message = message_of(lambda: KNNTD("MountainCar-v0", "CartPole-v1"))
     assert "MountainCar-v0" in message
     assert "CartPole-v1" in message
@@ -279,7 +279,7 @@ def test_total_timesteps_must_be_a_number(make_model: MakeModel, total_timesteps
 
 @pytest.mark.parametrize(("total_timesteps", "steps"), [(1e2, 100), (np.int64(7), 7), (12.5, 13), (0, 0), (-4, 0)])
 def test_total_timesteps_are_as_in_stable_baselines3(make_model: MakeModel, total_timesteps: Any, steps: int) -> None:
-    """The rest of a training that went a few steps too far is none."""
+    """The remaining steps of a finished training are 0 or slightly negative, as in SB3."""
     assert make_model().learn(total_timesteps).num_timesteps == steps
 
 
@@ -291,14 +291,14 @@ def test_total_timesteps_are_as_in_stable_baselines3(make_model: MakeModel, tota
         ({"learning_rate": 5.0, "step_size": "paper"}, "at most 4"),
     ],
 )
-def test_step_sizes_that_overshoot_are_warned_of(make_model: MakeModel, arguments: Any, most: str) -> None:
+def test_too_large_step_sizes_warn(make_model: MakeModel, arguments: Any, most: str) -> None:
     with pytest.warns(UserWarning, match="learning_rate=.*diverge") as warned:
         make_model(**arguments)
     assert most in str(warned[0].message)
 
 
 @pytest.mark.parametrize("arguments", [{"learning_rate": 1.0}, {"learning_rate": 4.0, "step_size": "paper"}])
-def test_other_step_sizes_are_not_warned_of(make_model: MakeModel, arguments: Any) -> None:
+def test_valid_step_sizes_do_not_warn(make_model: MakeModel, arguments: Any) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_model(**arguments)
@@ -309,11 +309,11 @@ def test_misspelt_arguments_are_an_error(make_model: MakeModel) -> None:
         make_model(n_neighbours=3)
 
 
-# --------------------------------------------- what environments should not do
+# --------------------------------------------------------- faulty environments
 
 
 class Faulty(gym.Wrapper[Any, Any, Any, Any]):
-    """From ``fault_at`` on, counted from 1 over all episodes, one step returns something that is not finite."""
+    """Step number ``fault_at``, counted from 1 over all episodes, returns a value that is not finite."""
 
     def __init__(self, env: gym.Env[Any, Any], fault_at: int, component: int | None, value: float) -> None:
         super().__init__(env)
@@ -333,7 +333,7 @@ class Faulty(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def faulty_venv(n_envs: int, faulty: int, **fault: Any) -> VecEnv:
-    """Only the environment numbered ``faulty`` is at fault."""
+    """Only the environment with index ``faulty`` is faulty."""
 
     def make(index: int) -> Callable[[], gym.Env[Any, Any]]:
         env = DriftEnv(offset=0.3 * index)
@@ -347,7 +347,7 @@ def faulty_venv(n_envs: int, faulty: int, **fault: Any) -> VecEnv:
 @pytest.mark.parametrize(("n_envs", "faulty"), [(1, 0), (3, 2)])
 # Episodes have 9, 14 and 6 steps: in the middle of one, at a termination, at a truncation.
 @pytest.mark.parametrize("fault_at", [1, 20, 9, 23])
-def test_fault_is_located_and_spoils_nothing(
+def test_fault_is_located_and_leaves_the_model_unchanged(
     make_model: MakeModel,
     tmp_path: pathlib.Path,
     n_envs: int,
@@ -374,7 +374,7 @@ def test_fault_is_located_and_spoils_nothing(
         assert f"component {component}" in message
     assert ("nan" if np.isnan(value) else "inf") in message.lower()
 
-    # The table is as the step before left it, and the model can be saved and used.
+    # The table is unchanged since the previous step, and the model can be saved and used.
     assert len(tables) == fault_at
     assert th.equal(model.policy.q_table, tables[-1])
     assert model.num_timesteps == (fault_at - 1) * n_envs
@@ -389,7 +389,7 @@ def test_fault_is_located_and_spoils_nothing(
 
 
 class FaultyReset(gym.Wrapper[Any, Any, Any, Any]):
-    """The episode numbered ``episode``, from 0, begins with a NaN."""
+    """Episode number ``episode``, counted from 0, starts with a NaN."""
 
     def __init__(self, env: gym.Env[Any, Any], episode: int) -> None:
         super().__init__(env)
@@ -412,7 +412,7 @@ def test_fault_in_a_first_observation(make_model: MakeModel, episode: int) -> No
 
 
 def test_learning_after_a_fault_does_not_bridge_it(make_model: MakeModel) -> None:
-    # The fault hides the end of the first episode; what follows it is another episode, and no outcome of the first.
+    # The fault interrupts the first episode; the next observation belongs to another episode.
     venv = DummyVecEnv([lambda: Faulty(GridEnv(lengths=[9], ends=["terminated"]), 9, None, NAN)])
     model = KNNTD(venv, gamma=1.0, trace_decay=1.0, exploration_initial_eps=0.0, tie_break="first", learning_rate=0.5)
     with pytest.raises(ValueError, match="finite"):
@@ -420,7 +420,7 @@ def test_learning_after_a_fault_does_not_bridge_it(make_model: MakeModel) -> Non
     before = model.policy.q_table.clone()
     model.learn(1, reset_num_timesteps=False)
     changed = (model.policy.q_table != before).any(dim=1)
-    # With γ = λ = 1 an error made in the second episode would reach every state of the first, had traces been kept.
+    # With γ = λ = 1 and kept traces, an error in the second episode would update every state of the first.
     assert int(changed.sum()) == 1
 
 
@@ -438,7 +438,7 @@ def test_fault_while_the_range_is_measured(component: int | None) -> None:
 def test_fault_behind_normalisation(make_model: MakeModel) -> None:
     venv = VecNormalize(faulty_venv(2, 1, fault_at=20, component=1, value=NAN))
     model = make_model(venv, bounds=([-2.0, -2.0], [2.0, 2.0]))
-    # VecNormalize spreads the NaN over all environments, so that only the component can be told.
+    # VecNormalize spreads the NaN to all environments, so only the component can be identified.
     with pytest.raises(ValueError, match=r"(?=.*component 1)(?=.*step 40)"):
         model.learn(100)
     assert th.isfinite(model.policy.q_table).all()

@@ -1,4 +1,4 @@
-"""True online SARSA(λ) with tile coding, and acting at random."""
+"""The baselines: true online SARSA(λ) with tile coding, and random actions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def corner(low: list[float], high: list[float]) -> Bounds:
 
 
 def test_tiles_are_those_of_the_book() -> None:
-    """Figure 9.11 of the book: tilings displaced by (1, 3) quarters of a tile."""
+    """Figure 9.11 of the book: tilings offset by (1, 3) quarters of a tile."""
     coder = TileCoder(corner([0.0, -1.0], [2.0, 1.0]), np.array([4, 5]), n_tilings=4)
     assert coder.n_features == 4 * 5 * 6
     rng = np.random.default_rng(0)
@@ -52,7 +52,7 @@ def test_tiles_end_at_the_bounds_and_share_weights_when_there_are_too_many(monke
 
 
 class Recorded(TileSarsa):
-    """Keeps which features it saw and which actions it chose, and what it got for them."""
+    """Records features, actions and rewards."""
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -76,7 +76,7 @@ class Recorded(TileSarsa):
     ("gamma", "trace_decay", "initial_value"), [(1.0, 0.9, 0.0), (0.9, 0.5, -4.0), (0.95, 0.0, 0.0)]
 )
 def test_it_learns_as_the_book_says(gamma: float, trace_decay: float, initial_value: float) -> None:
-    """The box on page 307, with whole vectors, against episodes that end and that are cut by the time limit."""
+    """Compare with the algorithm box on page 307, with dense vectors, for terminated and truncated episodes."""
     model = Recorded(
         "TilePolicy",
         "compare/Corridor-v0",
@@ -118,7 +118,7 @@ def test_it_learns_as_the_book_says(gamma: float, trace_decay: float, initial_va
     assert evaluate_policy(model, make_vec_env("compare/Corridor-v0", 5, seed=3), 20)[0] > -11
 
 
-def test_its_seed_decides_and_saving_keeps_it(tmp_path: Path) -> None:
+def test_results_depend_on_the_seed_and_survive_saving(tmp_path: Path) -> None:
     first, second, other = (
         TileSarsa("TilePolicy", make_vec_env("CartPole-v1", seed=seed), seed=seed).learn(1300) for seed in (3, 3, 4)
     )
@@ -132,7 +132,7 @@ def test_its_seed_decides_and_saving_keeps_it(tmp_path: Path) -> None:
     )
 
 
-def test_a_range_that_the_space_has_not_is_measured_first() -> None:
+def test_unbounded_ranges_are_measured_first() -> None:
     model = TileSarsa("TilePolicy", "CartPole-v1", seed=0).learn(MEASURING_STEPS)
     assert not model.policy.weights.any()
     low, high = model.policy.coder.bounds.low.clone(), model.policy.coder.bounds.high.clone()
@@ -154,7 +154,7 @@ def test_a_range_that_the_space_has_not_is_measured_first() -> None:
         ({"env": "FrozenLake-v1"}, r"takes observations in a Box of shape \(n,\)"),
     ],
 )
-def test_what_does_not_fit_is_refused(arguments: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         TileSarsa(**{"policy": "TilePolicy", "env": "MountainCar-v0", **arguments})
 

@@ -1,4 +1,4 @@
-"""The benchmarks run and write what they say they do. Their figures are the machine's own, and none is asserted."""
+"""The benchmarks run and write their results. No measured value is asserted."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 
 @pytest.fixture
 def benchmarks(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Imports a module of the benchmarks, which are run from the root of the repository and not installed."""
+    """A function that imports a benchmark module; benchmarks run from the repository root and are not installed."""
     monkeypatch.syspath_prepend(str(ROOT))
     return lambda name: importlib.import_module(f"benchmarks.{name}")
 
@@ -82,11 +82,11 @@ def test_speed_has_a_row_for_each_figure(benchmarks: Any) -> None:
     names = set(benchmarks("speed").BENCHMARKS)
     assert names >= {"bare1", "bare64", "dqn", "points", "huge", "neighbors", "episode", "kd_tree", "hnsw"}
     assert names >= {"predict", "startup", "memory64", "memory32"}
-    # One for accelerators too, which is left out with a word where there is none.
+    # Also one for GPUs, which is skipped with a message if there is none.
     assert "cuda" in names
 
 
-def test_without_an_accelerator_its_benchmark_is_left_out(
+def test_without_a_gpu_its_benchmark_is_skipped(
     benchmarks: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
@@ -96,7 +96,7 @@ def test_without_an_accelerator_its_benchmark_is_left_out(
 
 def test_ratios_are_medians_of_pairs(benchmarks: Any) -> None:
     speed = benchmarks("speed")
-    # The first of each is the warm-up, which does not count.
+    # The first value of each is the warm-up, which does not count.
     ones, others = iter([1e9, 6.0, 2.0, 30.0]), iter([1e-9, 2.0, 2.0, 3.0])
     row = speed.compare("a over b", "<= 2.5", lambda: next(ones), lambda: next(others), 3, "µs")
     assert (row.ratio, row.low, row.high) == (3.0, 1.0, 10.0)
@@ -126,7 +126,7 @@ def test_learning_prints_and_stores_its_table(
     learning = benchmarks("learning")
 
     class Here:
-        """Plays in this process: what is tested is the table, not the pool."""
+        """A pool that runs in this process, because this tests only the table."""
 
         def __enter__(self) -> Here:
             return self
@@ -208,12 +208,12 @@ def test_the_zoo_benchmark_evaluates_through_the_filter_that_was_learned(benchma
 def test_the_zoo_benchmark_ends_endless_episodes(benchmarks: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     zoo = benchmarks("zoo")
     monkeypatch.setattr(zoo, "MOST_STEPS", 20)
-    # As nothing is learned, the policy walks into the wall for ever.
+    # Without learning the policy would walk into the wall forever.
     settings = {"n_timesteps": 1.0, "policy": "KNNPolicy", "learning_rate": 0.0}
     assert zoo.play("knntd", "CliffWalking-v1", settings, seed=0, episodes=3)["returns"] == [-20.0] * 3
 
 
-def test_the_zoo_benchmark_stands_beside_published_figures(benchmarks: Any) -> None:
+def test_the_zoo_benchmark_lists_published_results(benchmarks: Any) -> None:
     zoo = benchmarks("zoo")
     row = zoo.Row("knntd", "LunarLander-v3", 500_000, [7, 8], [[100.0, 300.0], [0.0, 0.0]], [2.0, 4.0])
     _, _, ours, *theirs = zoo.table([row]).splitlines()
@@ -222,7 +222,7 @@ def test_the_zoo_benchmark_stands_beside_published_figures(benchmarks: Any) -> N
     ]
     assert len(theirs) == 3
     assert "| ppo | LunarLander-v2 | 242.12 | 31.82 |  | 1M | 1 |" in theirs[2]
-    # Mountain-Car of the paper is another environment than gymnasium's.
+    # The paper's Mountain-Car is a different environment from gymnasium's.
     assert len(zoo.table([row._replace(env_id="sb3_knntd/MountainCar-v0")]).splitlines()) == 3
 
 
@@ -259,7 +259,7 @@ def test_competition_counts_the_steps_of_each_episode(benchmarks: Any, monkeypat
     competition = benchmarks("competition")
     monkeypatch.setattr(competition, "EPISODES", 3)
     monkeypatch.setattr(competition, "MOST_STEPS", 50)
-    # Nobody leaves the valley in so few steps.
+    # The goal cannot be reached in so few steps.
     for variant in competition.VARIANTS:
         assert competition.learn(variant, 7) == [50, 50, 50]
 
@@ -272,7 +272,7 @@ def test_competition_is_learned_with_the_stored_configuration(benchmarks: Any) -
     KNNTD(competition.ENV_ID, **settings)
 
 
-def test_a_second_look_is_at_the_best_trials_and_what_is_there(benchmarks: Any) -> None:
+def test_tuning_compares_the_best_trials_with_the_configuration(benchmarks: Any) -> None:
     present = benchmarks("zoo").configurations()["knntd", "CartPole-v1"]
     study = optuna.create_study(direction="maximize")
 

@@ -38,7 +38,7 @@ class Waiting(BatchedCallback):
 
 
 class Listening(BaseCallback):
-    """Notes every call, and may end training."""
+    """Records every call, and may stop training."""
 
     def __init__(self, stop_at: int | None = None) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class Listening(BaseCallback):
 
 
 def expected(ends: list[int], every: int, n_calls: int) -> list[int]:
-    """The calls at which one is told who waits for ``every`` calls after each time."""
+    """The steps at which a callback is called that waits for ``every`` steps."""
     told = []
     due = every
     for call in range(1, n_calls + 1):
@@ -88,7 +88,7 @@ def test_a_batched_callback_is_called_when_due_and_when_episodes_end(
     assert [(call * n_envs, call in finding.ends) for call, _, _ in one.told] == [told[1:] for told in one.told]
     assert len(one.seen) == len(other.seen) == 300
     assert all(np.array_equal(a, b) for a, b in zip(one.seen, other.seen, strict=True))
-    # However it was told, it has counted all.
+    # It counts all steps in either case.
     assert one.n_calls == other.n_calls == 300
     assert one.num_timesteps == other.num_timesteps == 300 * n_envs
     assert listener.calls == ["start", "step", "end"] * (300 if beside else 0)

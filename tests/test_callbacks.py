@@ -1,4 +1,4 @@
-"""SB3's callbacks see what they expect, and what they return is heeded."""
+"""SB3's callbacks get what they expect, and their return values are respected."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def algorithm(request: pytest.FixtureRequest) -> Algorithm:
 
 
 class Witness(BaseCallback):
-    """Keeps what it was called with, in order; answers False at the call numbered ``stop_at``."""
+    """Records its calls in order; returns False at call number ``stop_at``."""
 
     def __init__(self, stop_at: int | None = None) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class Witness(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.calls.append("training_start")
-        # SB3's loggers of hyperparameters read these here.
+        # SB3's hyperparameter loggers read these here.
         assert "total_timesteps" in self.locals
         assert "log_interval" in self.locals
 
@@ -94,7 +94,7 @@ def test_returning_false_stops_after_that_step(make_model: MakeModel, make_venv:
 
 
 def test_step_is_learned_from_before_the_callback(make_model: MakeModel) -> None:
-    # Without exploration nothing hangs on the length of the run that was asked for.
+    # Without exploration the result does not depend on the requested length of the run.
     stopped = make_model(exploration_initial_eps=0.0).learn(600, callback=Witness(stop_at=17))
     assert stopped.policy.q_table.any()
     assert th.equal(stopped.policy.q_table, make_model(exploration_initial_eps=0.0).learn(17).policy.q_table)
@@ -112,7 +112,7 @@ def test_plain_function(make_model: MakeModel) -> None:
     assert model.num_timesteps == 5
 
 
-def test_list_of_callbacks_stops_if_one_says_so(make_model: MakeModel) -> None:
+def test_callback_list_stops_if_one_returns_false(make_model: MakeModel) -> None:
     for callback in ([Witness(), Witness(stop_at=8)], CallbackList([Witness(), Witness(stop_at=8)])):
         assert make_model().learn(100, callback=callback).num_timesteps == 8
 
@@ -153,7 +153,7 @@ def test_evaluation_beside_normalised_training(make_model: MakeModel, make_venv:
     train, evaluate = VecNormalize(make_venv(2)), VecNormalize(make_venv(1), training=False, norm_reward=False)
     callback = EvalCallback(evaluate, n_eval_episodes=2, eval_freq=50, verbose=0)
     make_model(train, bounds=([-2.0, -2.0], [2.0, 2.0])).learn(100, callback=callback)
-    # SB3 hands the statistics of training over to the evaluation.
+    # SB3 copies the statistics of training to the evaluation environment.
     np.testing.assert_array_equal(evaluate.obs_rms.mean, train.obs_rms.mean)
     assert evaluate.obs_rms.mean.any()
     assert np.isfinite(callback.last_mean_reward)
@@ -195,7 +195,7 @@ def test_stop_on_reward_threshold(make_model: MakeModel, make_venv: MakeVenv, th
 def test_stop_on_no_improvement(make_model: MakeModel, make_venv: MakeVenv) -> None:
     stop = StopTrainingOnNoModelImprovement(max_no_improvement_evals=1, min_evals=1, verbose=0)
     callback = EvalCallback(make_venv(), callback_after_eval=stop, n_eval_episodes=3, eval_freq=20, verbose=0)
-    # A model that does not learn does not improve: the first evaluation is the best, and the fourth one too many.
+    # A model that does not learn does not improve: the first evaluation is the best, and the fourth one stops training.
     model = make_model(learning_rate=0.0).learn(1_000, callback=callback)
     assert model.num_timesteps < 200
 
@@ -234,7 +234,7 @@ def test_error_in_a_callback_leaves_a_usable_model(
         model.learn(100, callback=fail)
     model.save(tmp_path / "model")
     assert algorithm.load(tmp_path / "model").num_timesteps == 50
-    # The fifty first steps are not lost, and the next fifty follow on them.
+    # The first fifty steps are kept, and the next fifty continue from them.
     model.learn(50, reset_num_timesteps=False)
     assert model.num_timesteps == 100
     assert th.equal(model.policy.q_table, make_model().learn(100).policy.q_table)

@@ -1,4 +1,4 @@
-"""The command line, used as a user would."""
+"""The command line, as a user runs it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from sb3_knntd.cli import main
 from sb3_knntd.common import command_line
 from sb3_knntd.common.command_line import CommandError
 
-# SB3 silences it when it is imported, which pytest undoes.
+# SB3 silences this warning at import, which pytest undoes.
 pytestmark = pytest.mark.filterwarnings("ignore:rich is experimental")
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -78,7 +78,7 @@ def _registered() -> Iterator[None]:
 
 
 def error_of(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """Run a command that must be refused; return the line that says why."""
+    """Run a command that must be refused; return its error message."""
     with pytest.raises(SystemExit) as refused:
         main(argv)
     output = capsys.readouterr()
@@ -142,13 +142,13 @@ def test_the_table_is_that_of_the_saved_model(
     monkeypatch.setattr(sb3_knntd.experiments.demo, "_print_returns", lambda title, returns: shown.update(returns))
     assert main(["demo", "--env", "Corridor-v0", "--steps", "400", "--out", str(tmp_path)]) == 0
     assert len(shown["KNNTD"]) == len(shown["random policy"]) == 100
-    # Four steps are the least; a policy that learned takes them in every episode.
+    # Four steps are the minimum; a trained policy takes four in every episode.
     np.testing.assert_array_equal(shown["KNNTD"], -4)
     assert shown["random policy"].mean() < -8
     assert shown["random policy"].std() > 0
 
 
-def test_the_same_seed_tells_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_same_seed_gives_the_same_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables = []
     for run in "ab":
         assert (
@@ -161,7 +161,7 @@ def test_the_same_seed_tells_the_same(tmp_path: Path, capsys: pytest.CaptureFixt
     np.testing.assert_array_equal(first.policy.q_table.numpy(), second.policy.q_table.numpy())
 
 
-def test_a_second_demo_takes_the_place_of_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_second_demo_replaces_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for steps in (100, 60):
         assert main(["demo", "--env", "Corridor-v0", "--steps", str(steps), "--out", str(tmp_path)]) == 0
     assert KNNTD.load(tmp_path / "knntd_Corridor-v0.zip").num_timesteps == 60
@@ -173,7 +173,7 @@ def test_a_demo_of_a_single_step(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (tmp_path / "knntd_Corridor-v0_learning_curve.png").read_bytes().startswith(PNG)
 
 
-def test_a_table_of_states_has_no_picture_of_values(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_finite_states_have_no_value_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--env", "FrozenLake-v1", "--steps", "200", "--out", str(tmp_path)]) == 0
     assert (tmp_path / "knntd_FrozenLake-v1_learning_curve.png").is_file()
     assert not (tmp_path / "knntd_FrozenLake-v1_value_function.png").exists()
@@ -210,7 +210,7 @@ def test_a_second_ctrl_c_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["demo", "--env", "InterruptedTwice-v0", "--steps", "5000", "--out", str(tmp_path)]) == 130
     assert signal.getsignal(signal.SIGINT) is handler
     assert "Interrupted." in capsys.readouterr().err
-    # The progress bar that was torn off prints once more when it is collected: here, not in another test's output.
+    # The interrupted progress bar prints once more when it is collected: do this here, not in another test.
     gc.collect()
     assert not (tmp_path / "knntd_InterruptedTwice-v0.zip").exists()
 
@@ -248,7 +248,7 @@ def test_continuous_actions_are_shown_with_exa(tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "tensorboard" / "ExA_1").is_dir()
 
 
-def test_spaces_that_do_not_fit_are_refused_in_the_words_of_the_algorithm(
+def test_unsupported_spaces_give_the_message_of_the_algorithm(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -259,7 +259,7 @@ def test_spaces_that_do_not_fit_are_refused_in_the_words_of_the_algorithm(
     assert not out.exists()
 
 
-def test_where_an_error_came_from_is_shown_on_demand(tmp_path: Path) -> None:
+def test_traceback_is_shown_on_demand(tmp_path: Path) -> None:
     with pytest.raises(CommandError, match="Broken-v0") as error:
         main(["--traceback", "demo", "--env", "Broken-v0", "--out", str(tmp_path)])
     assert isinstance(error.value.__cause__, ZeroDivisionError)
@@ -273,7 +273,7 @@ def test_steps_must_be_a_positive_whole_number(steps: str, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize("seed", ["-1", "4294967296", "x"])
-def test_seed_must_be_one(seed: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_seeds_are_refused(seed: str, capsys: pytest.CaptureFixture[str]) -> None:
     error = error_of(["demo", f"--seed={seed}"], capsys)
     assert "--seed" in error
     assert repr(seed) in error
@@ -302,7 +302,7 @@ def test_out_must_be_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize("argv", [[], ["dance"], ["demo", "--episodes", "3"], ["demo", "extra"]])
-def test_what_is_no_command_is_refused(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_commands_are_refused(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert ": error: " in error_of(argv, capsys)
 
 

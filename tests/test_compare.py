@@ -81,7 +81,7 @@ def comparison(*tasks: Task, **more: Any) -> Comparison:
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_repetitions() -> Iterator[None]:
-    """Two thousand take seconds a report."""
+    """Use fewer resamples: two thousand take seconds per report."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(statistics, "REPETITIONS", 50)
         yield
@@ -92,7 +92,7 @@ def _few_repetitions() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path]:
-    """The arguments of a small comparison that has come through, and its folder."""
+    """The arguments of a finished small comparison, and its folder."""
     out = tmp_path_factory.mktemp("compare") / "results"
     arguments = ["compare", "--env", "compare/Corridor-v0", "--algos", "knntd", "sarsa", "--seeds", "2"]
     arguments += [*TINY, "--workers", "2", "--out", str(out)]
@@ -100,7 +100,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path]
     return arguments, out
 
 
-def test_it_runs_everything_and_writes_all_files(compared: tuple[list[str], Path]) -> None:
+def test_compare_runs_everything_and_writes_all_files(compared: tuple[list[str], Path]) -> None:
     _, out = compared
     assert {path.name for path in out.iterdir()} == {
         "runs", "images", "report.html", "report.json", "summary.csv", "curves.csv"
@@ -131,7 +131,7 @@ def test_it_runs_everything_and_writes_all_files(compared: tuple[list[str], Path
     assert "--seeds 2 --first-seed 1000 --steps 300" in stored["command"]
 
 
-def test_it_goes_on_where_it_was_and_computes_the_same(
+def test_an_interrupted_comparison_continues_with_the_same_results(
     compared: tuple[list[str], Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     arguments, out = compared
@@ -139,7 +139,7 @@ def test_it_goes_on_where_it_was_and_computes_the_same(
     (lost,) = (out / "runs").glob("*-knntd-1001-*")
     content = json.loads(lost.read_bytes())
     lost.unlink()
-    # One more seed; the page is made anew.
+    # One more seed; the report is written again.
     (out / "report.html").unlink()
     grown = [*arguments[: arguments.index("--seeds")], "--seeds", "3", *arguments[arguments.index("--seeds") + 2 :]]
     assert main(grown) == 0
@@ -156,14 +156,12 @@ def test_it_goes_on_where_it_was_and_computes_the_same(
         assert again["result"][name] == content["result"][name]
     assert again["result"]["seconds"] != content["result"]["seconds"]
 
-    # Other settings do not overwrite what is there.
+    # Other settings do not overwrite existing results.
     assert main([*grown[:-2], "--steps", "150", "--seeds", "1", "--out", str(out)]) == 0
     assert len(list((out / "runs").glob("*.json"))) == 12
 
 
-def test_a_run_that_raises_is_told_of_and_does_not_sink_the_rest(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_failing_run_is_reported_and_the_others_finish(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "results"
     arguments = ["compare", "--env", "compare/Corridor-v0", "compare/Broken-v0", "--algos", "random", "--seeds", "1"]
     assert main([*arguments, *TINY, "--out", str(out)]) == 1
@@ -191,7 +189,7 @@ def test_evaluation_does_not_change_what_is_learned() -> None:
     assert alone.policy.q_table.equal(model.policy.q_table)  # type: ignore[operator, attr-defined, union-attr]
 
 
-def test_starts_are_the_same_for_every_algorithm_and_others_than_in_training() -> None:
+def test_evaluation_starts_are_equal_for_all_algorithms_and_differ_from_training() -> None:
     prepare()
     starts: dict[str, list[np.ndarray]] = {}
     for algo, policy in (("random", "RandomPolicy"), ("sarsa", "TilePolicy")):
@@ -214,7 +212,7 @@ def test_starts_are_the_same_for_every_algorithm_and_others_than_in_training() -
     assert not (first == trained_from).all(axis=1).any()
 
 
-def test_normalised_observations_are_evaluated_as_they_are_learned_from() -> None:
+def test_evaluation_normalises_observations_as_training_does() -> None:
     prepare()
     hyperparams = {"policy": "MlpPolicy", "normalize": True, "n_envs": 4, "n_steps": 16, "batch_size": 64}
     with experiment("ppo", "CartPole-v1", hyperparams, 256, seed=0) as (manager, model, _):
@@ -228,7 +226,7 @@ def test_normalised_observations_are_evaluated_as_they_are_learned_from() -> Non
         np.testing.assert_array_equal(env.obs_rms.mean, training.obs_rms.mean)  # type: ignore[union-attr]
         assert not env.training
         assert min(recorder.returns) >= 5, "returns are normalised, not the environment's own"
-    # Four environments in step pass a point and do not stop at it.
+    # Steps of four environments can pass a point without stopping at it.
     assert recorder.steps == [128, 252]
 
 
@@ -334,7 +332,7 @@ def test_algorithms_fit_by_their_actions() -> None:
         (["--first-seed", "2147483640"], "seeds go to 2147483647; got 10 from 2147483640 on"),
     ],
 )
-def test_a_mistake_is_told_of_before_anything_is_computed(
+def test_wrong_arguments_are_reported_before_anything_is_computed(
     arguments: list[str],
     message: str,
     tmp_path: Path,
@@ -352,9 +350,7 @@ def test_a_mistake_is_told_of_before_anything_is_computed(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_configuration_that_cannot_be_built_is_told_of_at_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_invalid_configuration_is_reported_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.yml"
     path.write_text(yaml.safe_dump({"default": {"policy": "KNNPolicy", "n_neighbors": 0}}))
     with pytest.raises(SystemExit, match="2"):
@@ -382,7 +378,7 @@ def test_costs_to_a_threshold() -> None:
     rows = {row["algo"]: row for row in task_rows(task({"knntd": [[0, 100], [0, 0], [100, 0]], "random": [[0, 0]]}))}
     assert (rows["knntd"]["reached"], rows["knntd"]["steps_to_threshold"]) == (2, 200.0)
     assert (rows["random"]["reached"], rows["random"]["steps_to_threshold"]) == (0, math.inf)
-    # Half of the seeds are not more than half of them.
+    # Exactly half of the seeds is not a majority.
     (half, _) = task_rows(task({"knntd": [[100, 0], [100, 0], [0, 0], [0, 0]], "random": [[0, 0]]}))
     assert half["steps_to_threshold"] == math.inf
     (all_, _) = task_rows(task({"knntd": [[100, 0], [0, 100]], "random": [[0, 0]]}))
@@ -391,11 +387,11 @@ def test_costs_to_a_threshold() -> None:
     assert math.isnan(unknown["steps_to_threshold"])
 
 
-def test_scores_are_between_acting_at_random_and_the_threshold() -> None:
+def test_scores_are_normalised_by_random_actions_and_the_threshold() -> None:
     known = task({"knntd": [[10, 60], [35, 110]], "random": [[8, 12], [10, 10]]}, threshold=60.0)
     assert (known.floor, known.top) == (10.0, 60.0)
     np.testing.assert_allclose(known.scores("knntd"), [[0, 1], [0.5, 2]])
-    # Without a threshold, or with one that acting at random reaches, the best mean at the end is 1.
+    # Without a threshold, or with one that random actions reach, the best final mean has a score of 1.
     for threshold in (None, 9.0):
         unknown = known._replace(threshold=threshold)
         assert unknown.top == 85.0
@@ -404,13 +400,13 @@ def test_scores_are_between_acting_at_random_and_the_threshold() -> None:
     assert not hopeless.scores("knntd").any()
 
 
-def test_environments_with_the_same_algorithms_are_told_of_together() -> None:
+def test_environments_with_the_same_algorithms_are_grouped() -> None:
     same = {"knntd": [[1.0], [2.0]], "random": [[0.0], [0.0]]}
     a, b, c = task(same, "A"), task({"exa": [[1.0]], "random": [[0.0]]}, "B"), task(same, "C")
     groups = make_groups([a, b, c])
     assert [[t.env for t in group.tasks] for group in groups] == [["A", "C"], ["B"]]
     assert groups[0].scores("knntd").shape == (2, 2, 1)
-    # A seed that failed on one of them does not count.
+    # A seed that failed on one environment does not count.
     short = c._replace(runs={"knntd": c.runs["knntd"][1:], "random": c.runs["random"]})
     np.testing.assert_allclose(Group([a, short], ["knntd"]).scores("knntd"), [[[0.02], [0.02]]])
 
@@ -441,7 +437,7 @@ def test_statistics_are_those_of_rliable() -> None:
 # --------------------------------------------------------------------- report
 
 
-def test_the_reader_is_told_what_to_read_with_care() -> None:
+def test_the_report_warns_about_results_that_are_not_comparable() -> None:
     runs = {"knntd": [[0.0, 90.0, 120.0]] * 5, "random": [[0.0, 0.0, 0.0]] * 5}
     assert cautions(comparison(task(runs))) == []
     one = comparison(task(runs))
@@ -461,7 +457,7 @@ def test_the_reader_is_told_what_to_read_with_care() -> None:
         assert f"different {word}" in caution
 
 
-def test_the_report_tells_of_costs_failures_and_configurations() -> None:
+def test_the_report_shows_costs_failures_and_configurations() -> None:
     runs = {"knntd": [[0.0, 90.0, 120.0]] * 5, "random": [[0.0, 0.0, 0.0]] * 5}
     told = comparison(task(runs), failures={"<run>": "why & how"}, notes=["DQN cannot."])
     page = make_report(told)["report.html"].decode()
@@ -469,7 +465,7 @@ def test_the_report_tells_of_costs_failures_and_configurations() -> None:
         assert words in page
 
 
-def test_the_report_is_the_same_whenever_it_is_made_and_valid_everywhere() -> None:
+def test_the_report_is_reproducible_and_valid_json() -> None:
     a = task({"knntd": [[0, 90, 50]] * 5, "random": [[0, 0, 0]] * 5}, "A/x-v0", threshold=None)
     b = task({"exa": [[0, 90, 60]] * 5, "random": [[0, 0, 0]] * 5}, "B-v0")
     first, second = (make_report(comparison(a, b)) for _ in range(2))
@@ -518,7 +514,7 @@ def test_the_page_in_a_browser(compared: tuple[list[str], Path]) -> None:
                 assert natural > 200
                 assert shown > 0.8 * min(width, 500)
                 assert alternative
-            # Nothing but tables, which scroll on their own, is wider than the window.
+            # Only tables, which scroll separately, are wider than the window.
             assert page.evaluate("document.documentElement.scrollWidth") == width
             smallest = page.eval_on_selector_all(
                 "p, td, li", "all => all.map(e => parseFloat(getComputedStyle(e).fontSize))"
@@ -549,7 +545,7 @@ def test_the_page_in_a_browser(compared: tuple[list[str], Path]) -> None:
 
 
 def test_fresh_processes(tmp_path: Path) -> None:
-    """Each job in a process of its own, from one that has imported what they need; death and failure as ever."""
+    """Each job runs in a new process that inherits imports; dying and failing jobs are handled as usual."""
     (tmp_path / "pids").mkdir()
     jobs = [
         *(Job(f"slow-{n}", job_functions.slow, {"seconds": 0, "folder": str(tmp_path / "pids")}) for n in range(4)),
@@ -598,7 +594,7 @@ def test_fresh_processes_end_with_the_program(tmp_path: Path, blow: signal.Signa
         assert time.monotonic() < end, "the second job never began"
         time.sleep(0.05)
     if blow == signal.SIGINT:
-        os.killpg(program.pid, blow)  # as a terminal does
+        os.killpg(program.pid, blow)  # like a terminal
     else:
         os.kill(program.pid, blow)
     program.wait(60)
@@ -609,7 +605,7 @@ def test_fresh_processes_end_with_the_program(tmp_path: Path, blow: signal.Signa
     assert [path.name for path in folder.glob("*.json")] == ["0.json"]
 
 
-def test_progress_says_what_runs_and_what_is_left(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_progress_shows_running_and_remaining_jobs(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     jobs = [Job(name, job_functions.unstorable, {}) for name in "abc"]
 
     def backend(missing: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A configuration of a comparison is data: nothing of it is run."""
+"""Configurations of a comparison are data: no code in them is run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sb3_knntd.experiments.compare.run import is_result
         ("HerReplayBuffer", HerReplayBuffer),
     ],
 )
-def test_what_configurations_say_is_read(expression: str, value: Any) -> None:
+def test_allowed_expressions_are_evaluated(expression: str, value: Any) -> None:
     found = evaluate("policy_kwargs", expression)
     expected = value or {"log_std_init": -2, "activation_fn": nn.ReLU, "net_arch": {"pi": [64]}}
     assert found == expected
@@ -80,7 +80,7 @@ def test_anything_else_is_refused(expression: str, tmp_path: Path, monkeypatch: 
         {"policy": "os.system"},
     ],
 )
-def test_a_class_is_one_of_its_kind(
+def test_classes_must_have_the_required_base(
     hyperparams: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "mine.py").write_text("open('mark', 'w')")
@@ -125,7 +125,7 @@ RESULT: dict[str, Any] = {
         {"versions": [1]},
     ],
 )
-def test_what_cannot_be_a_result_is_told_from_one(change: dict[str, Any]) -> None:
+def test_invalid_results_are_detected(change: dict[str, Any]) -> None:
     assert is_result(RESULT)
     assert not is_result({**RESULT, **change})
     for name in RESULT:

@@ -1,4 +1,4 @@
-"""Jobs and comparisons on a Ray cluster of several nodes, on loopback, one of which dies."""
+"""Jobs and comparisons on a Ray cluster of several local nodes, one of which dies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sb3_knntd.distributed.ray_jobs import connected, run_on_ray
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """A head that computes nothing, and a node; this process is connected."""
+    """A cluster of a head without CPUs and one node; this process is connected to it."""
     with loopback_cluster(num_cpus=1) as made:
         yield made
 
@@ -39,7 +39,7 @@ def wait_until(condition: Any, seconds: float = 90.0) -> None:
         time.sleep(0.05)
 
 
-def test_a_node_that_dies_costs_nothing(cluster: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_jobs_of_a_dead_node_are_repeated(cluster: Cluster, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     pids = tmp_path / "pids"
     pids.mkdir()
     doomed = cluster.add_node(num_cpus=1, **NODE)
@@ -67,7 +67,7 @@ def test_a_node_that_dies_costs_nothing(cluster: Cluster, tmp_path: Path, capfd:
     alone = outcomes["threads"].result
     assert (alone["torch"], alone["openmp"]) == (1, "1")
     assert alone["process"] not in {*begun, os.getpid()}
-    # Each was told of once, and stored.
+    # Each was reported once, and stored.
     err = capfd.readouterr().err
     assert [f"t: {n} of 4" in err for n in range(1, 6)] == [True] * 4 + [False]
     stored = {path.stem: json.loads(path.read_bytes()) for path in (tmp_path / "jobs").iterdir()}
@@ -89,15 +89,15 @@ def test_the_backend_does_not_change_what_is_learned(cluster: Cluster, tmp_path:
         assert there["arguments"] == here["arguments"]
         for what in ("steps", "returns", "stds", "versions"):
             assert there["result"][what] == here["result"][what]
-    # What one has computed the other goes on from.
+    # One backend continues with the results of the other.
     before = {name: (tmp_path / "ray" / "runs" / name).stat().st_mtime_ns for name in names}
     assert main([*arguments, "--out", str(tmp_path / "ray")]) == 0
     assert before == {name: (tmp_path / "ray" / "runs" / name).stat().st_mtime_ns for name in names}
 
 
 @pytest.mark.slow
-def test_a_cluster_elsewhere(cluster: Cluster, tmp_path: Path) -> None:
-    """By Ray's own client, from a program that is no part of the cluster."""
+def test_a_remote_cluster(cluster: Cluster, tmp_path: Path) -> None:
+    """Connect with Ray's client, from a program outside the cluster."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -116,7 +116,7 @@ def test_a_cluster_elsewhere(cluster: Cluster, tmp_path: Path) -> None:
     assert (tmp_path / "report.html").exists()
 
 
-def test_what_is_interrupted_is_stopped(cluster: Cluster, tmp_path: Path) -> None:
+def test_interrupting_stops_the_jobs(cluster: Cluster, tmp_path: Path) -> None:
     pids = tmp_path / "pids"
     pids.mkdir()
     events = run_on_ray([Job("slow", job_functions.slow, {"seconds": 600, "folder": str(pids)})])
@@ -127,7 +127,7 @@ def test_what_is_interrupted_is_stopped(cluster: Cluster, tmp_path: Path) -> Non
     wait_until(lambda: not Path(f"/proc/{path.name.split('-')[1]}").exists())
 
 
-def test_a_cluster_that_is_not_there_is_told_of(
+def test_a_missing_cluster_is_reported(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with connected("ray://127.0.0.1:1"):

@@ -1,4 +1,4 @@
-"""The same seed gives the same table to the last bit, another seed another."""
+"""The same seed gives the same table bit for bit, another seed a different one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ CHANCE = [
 @pytest.mark.parametrize("n_envs", [1, 3])
 @pytest.mark.parametrize(("algorithm", "settings"), CHANCE)
 def test_seeds(make_model: MakeModel, make_venv: MakeVenv, settings: dict[str, Any], n_envs: int) -> None:
-    # The environments know no chance: all that differs is what the model draws.
+    # The environments are deterministic: only the random numbers of the model differ.
     first, second, other = (make_model(make_venv(n_envs), seed=seed, **settings).learn(150) for seed in (5, 5, 6))
     assert th.equal(first.policy.q_table, second.policy.q_table)
     assert not th.equal(first.policy.q_table, other.policy.q_table)
@@ -53,7 +53,7 @@ def test_seeds(make_model: MakeModel, make_venv: MakeVenv, settings: dict[str, A
 def test_environments_are_seeded(algorithm: Algorithm, mountain_car: str, n_envs: int) -> None:
     def learn(seed: int) -> th.Tensor:
         venv = make_vec_env(lambda: gym.make(mountain_car, max_episode_steps=25), n_envs)
-        # Nothing is drawn but the starts of the episodes.
+        # Only the initial states are random.
         model = algorithm(venv, points=8, n_neighbors=4, exploration_initial_eps=0.0, tie_break="first", seed=seed)
         return model.learn(120).policy.q_table
 
@@ -66,7 +66,7 @@ def test_no_seed_no_repetition(make_model: MakeModel) -> None:
     assert not th.equal(first.policy.q_table, second.policy.q_table)
 
 
-def test_no_seed_does_not_hang_on_the_global_generators(make_model: MakeModel) -> None:
+def test_without_a_seed_global_generators_do_not_matter(make_model: MakeModel) -> None:
     tables = []
     for _ in range(2):
         np.random.seed(0)
@@ -75,7 +75,7 @@ def test_no_seed_does_not_hang_on_the_global_generators(make_model: MakeModel) -
     assert not th.equal(*tables)
 
 
-def test_draws_do_not_hang_on_other_users_of_the_global_generators(make_model: MakeModel) -> None:
+def test_other_users_of_the_global_generators_do_not_matter(make_model: MakeModel) -> None:
     def draw(*_: Any) -> bool:
         np.random.random()
         th.rand(1)
@@ -85,27 +85,27 @@ def test_draws_do_not_hang_on_other_users_of_the_global_generators(make_model: M
     assert th.equal(alone.policy.q_table, beside.policy.q_table)
 
 
-def test_set_random_seed_begins_the_sequence_anew(make_model: MakeModel) -> None:
+def test_set_random_seed_restarts_the_sequence(make_model: MakeModel) -> None:
     reseeded = make_model(seed=1, **EXPLORING)
     reseeded.set_random_seed(5)
     assert th.equal(reseeded.learn(150).policy.q_table, make_model(seed=5, **EXPLORING).learn(150).policy.q_table)
 
 
-def test_kind_of_vec_env_decides_nothing(make_model: MakeModel, make_venv: MakeVenv) -> None:
+def test_the_vec_env_class_does_not_matter(make_model: MakeModel, make_venv: MakeVenv) -> None:
     dummy, subproc = (make_model(make_venv(2, kind)).learn(120) for kind in (DummyVecEnv, SubprocVecEnv))
     assert dummy.policy.q_table.any()
-    # DummyVecEnv rounds rewards to float32, and SubprocVecEnv does not.
+    # DummyVecEnv rounds rewards to float32; SubprocVecEnv does not.
     th.testing.assert_close(dummy.policy.q_table, subproc.policy.q_table, rtol=1e-5, atol=1e-5)
 
 
-def test_first_ties_without_exploration_involve_no_chance(make_model: MakeModel) -> None:
+def test_tie_break_first_without_exploration_is_deterministic(make_model: MakeModel) -> None:
     settings = {"exploration_initial_eps": 0.0, "tie_break": "first"}
     first, second = (make_model(seed=seed, **settings).learn(150) for seed in (1, 2))
     assert th.equal(first.policy.q_table, second.policy.q_table)
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_length_of_the_call_decides_nothing_without_schedules(
+def test_without_schedules_total_timesteps_do_not_matter(
     make_model: MakeModel, make_venv: MakeVenv, n_envs: int
 ) -> None:
     settings = {"exploration_initial_eps": 0.3, "exploration_final_eps": 0.3}
@@ -121,8 +121,8 @@ def test_length_of_the_call_decides_nothing_without_schedules(
     seed=st.integers(0, 2**31 - 1),
 )
 @settings(max_examples=25, deadline=None)
-def test_a_stream_goes_on_from_a_saved_position(shape: tuple[int, ...], before: int, after: int, seed: int) -> None:
-    """Whatever the width of its rows, which says how many of them are made at a time."""
+def test_a_stream_continues_from_a_saved_position(shape: tuple[int, ...], before: int, after: int, seed: int) -> None:
+    """For any row width, which determines how many rows are generated at a time."""
     stream, other = RandomStream(shape), RandomStream(shape)
     stream.seed(seed)
     for _ in range(before):

@@ -1,4 +1,4 @@
-"""What the README and the documentation show must run as it stands there, and tell of all there is."""
+"""The code and commands in the README and the documentation run, and the reference is complete."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ PAGES = [page for page in PAGES if "_build" not in page.parts]
 
 
 def blocks(page: Path, language: str) -> list[Token]:
-    """The code blocks of one language on a page, wherever they stand."""
+    """All code blocks of one language on a page."""
     tokens = MarkdownIt().enable("table").parse(page.read_text(encoding="utf-8"))
     return [token for token in tokens if token.type == "fence" and token.info.strip() == language]
 
 
 def commands(page: Path) -> Iterator[list[str]]:
-    """The commands of a page, as words."""
+    """The commands of a page, split into words."""
     for block in blocks(page, "bash"):
         waiting = ""
         for line in block.content.replace("\\\n", " ").splitlines():
             waiting += f"{line}\n"
             try:
                 words = shlex.split(waiting, comments=True)
-            except ValueError:  # a quotation goes on in the next line
+            except ValueError:  # a quotation continues on the next line
                 continue
             waiting = ""
             if words:
@@ -74,7 +74,7 @@ def test_pages_are_found() -> None:
 
 @pytest.mark.parametrize("page", RUNNING, ids=name_of)
 def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
-    # One after the other in a program of its own, as a reader would type them; a traceback names the line of the page.
+    # Run the blocks as one program; a traceback has the line numbers of the page.
     program = ""
     for block in blocks(page, "python"):
         assert block.map is not None
@@ -84,16 +84,16 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
 
 
 class ArgumentsReadError(BaseException):
-    """The arguments of a command have been read, and it is about to begin its work."""
+    """Raised when a command has parsed its arguments."""
 
 
 def parse(command: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run a command as far as to where its arguments are read."""
+    """Run a command until its arguments are parsed."""
     original = argparse.ArgumentParser.parse_args
 
     def parse_args(self: Any, args: Any = None, namespace: Any = None) -> Any:
         parsed = original(self, args, namespace)
-        if "arguments" in parsed:  # those of RL Zoo, which reads them itself
+        if "arguments" in parsed:  # commands of RL Zoo, which parses them itself
             return parsed
         raise ArgumentsReadError
 
@@ -128,13 +128,13 @@ def test_commands_exist_and_take_their_arguments(page: Path, words: list[str], m
 
 
 def linked_files() -> list[tuple[Path, str]]:
-    """Links to files on the pages that Sphinx does not check."""
+    """Links to files on pages that Sphinx does not check."""
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
     return [(page, link) for page in pages for link in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))]
 
 
 @pytest.mark.parametrize(("page", "link"), linked_files(), ids=lambda value: getattr(value, "name", value))
-def test_links_lead_somewhere(page: Path, link: str) -> None:
+def test_links_exist(page: Path, link: str) -> None:
     assert (page.parent / link).exists()
 
 
@@ -172,9 +172,9 @@ def test_pictures_of_the_algorithms_are_drawn(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == set(shown)
 
 
-def test_citation_tells_of_this_version_and_of_the_paper() -> None:
+def test_citation_matches_this_version_and_the_paper() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    # What the format demands.
+    # Required fields of the format.
     assert {"cff-version", "message", "title", "authors"} <= citation.keys()
     assert citation["title"] == PROJECT["name"]
     assert citation["version"] == PROJECT["version"]

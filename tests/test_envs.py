@@ -1,4 +1,4 @@
-"""The paper's environments: their equations, what may be varied, and that they are good gymnasium environments."""
+"""The paper's environments: equations, options, and compliance with gymnasium."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CAR, POLE = "sb3_knntd/MountainCar-v0", "sb3_knntd/CartPole-v0"
 CONTINUOUS, ACROBOT = "sb3_knntd/ContinuousCartPole-v0", "sb3_knntd/Acrobot-v0"
 ALL = (CAR, POLE, CONTINUOUS, ACROBOT)
 
-# Every environment as it comes and with each argument away from its default at least once.
+# Every environment with its defaults, and with each argument changed at least once.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in ALL),
     (CAR, {"start": "uniform", "reward": "goal", "noise": 0.05}),
@@ -51,7 +51,7 @@ def make(name: str, **kwargs: Any) -> Any:
 
 @pytest.fixture
 def headless(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets windows open where there is no screen."""
+    """Allow windows on machines without a screen."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pytest.importorskip("pygame")
 
@@ -153,7 +153,7 @@ def test_mountain_car_moves_as_gymnasiums() -> None:
     ours, theirs = make(CAR), gym.make("MountainCar-v0").unwrapped
     ours.reset(), theirs.reset()
     for _ in range(300):
-        # The ends of both ranges come up, too. Beyond the goal no episode goes on.
+        # Include the ends of both ranges. No episode continues beyond the goal.
         state = np.clip(rng.uniform((-1.3, -0.08), (0.55, 0.08)), (-1.2, -0.07), (0.499, 0.07))
         ours.state, theirs.state = tuple(state.tolist()), state
         action = int(rng.integers(3))
@@ -208,7 +208,7 @@ def test_the_two_acrobots_differ() -> None:
     assert acrobot_step(state, 1) != pytest.approx(acrobot_step(state, 1, True), rel=1e-3)
 
 
-def test_the_shortest_way_up_the_mountain() -> None:
+def test_the_shortest_path_up_the_mountain() -> None:
     # Found by breadth-first search from (-0.5, 0).
     env = make(CAR)
     env.reset()
@@ -261,7 +261,7 @@ def test_rewards_of_the_cart_pole(name: str) -> None:
         assert terminated
         fallen = -10000 - 50 * abs(position) - 100 * abs(angle)
         assert last == pytest.approx({"shaped": fallen, "step": 1.0, "failure": -1.0}[reward])
-        # Reported at the limit of the space, known exactly to the environment.
+        # The observation is clipped to the space; the state is exact.
         assert observation[2] == np.float32(-math.radians(12.0))
         assert angle < -math.radians(12.0)
 
@@ -294,7 +294,7 @@ def test_forces_of_the_discrete_cart_pole() -> None:
             assert discrete.state == pytest.approx(continuous.state)
 
 
-def test_the_continuous_force_ends_at_its_limits() -> None:
+def test_the_continuous_force_is_clipped() -> None:
     states = []
     for force in (1.0, 5.0):
         env = make(CONTINUOUS)
@@ -358,7 +358,7 @@ def test_options_of_reset(name: str) -> None:
 
 # --- noise ------------------------------------------------------------------------------------------------------------
 
-# Widths of the usual ranges, of which noise is a share.
+# Widths of the usual ranges; the noise is a share of them.
 WIDTHS = {
     CAR: (1.8, 0.14),
     POLE: (9.0, 6.0, 2 * math.radians(12), 2 * math.radians(60)),
@@ -385,7 +385,7 @@ def test_noise_is_a_share_of_each_range(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_noise_touches_the_observation_only(name: str) -> None:
+def test_noise_affects_only_the_observation(name: str) -> None:
     noisy, quiet = make(name, noise=0.1), make(name)
     quiet.action_space.seed(0)
     noisy.reset(seed=1), quiet.reset(seed=1)
@@ -409,16 +409,16 @@ def test_noise_comes_from_the_environments_generator() -> None:
     assert (roll(1) != roll(2)).all()
 
 
-def test_noise_on_angles_goes_round() -> None:
+def test_noise_on_angles_wraps_around() -> None:
     env = make(ACROBOT, noise=[0.01, 0.01, 0, 0], start=(math.pi, -math.pi, 0, 0))
     env.reset(seed=0)
     angles = np.array([env.reset()[0][:2] for _ in range(400)])
-    # Half of them on either side, and none piled up at the limit.
+    # Half of them on either side, and none clipped to the limit.
     assert 0.4 < (angles > 0).mean() < 0.6
     assert (np.abs(angles) > math.pi - 1e-4).mean() < 0.01
 
 
-# --- good citizens ----------------------------------------------------------------------------------------------------
+# --- gymnasium API ----------------------------------------------------------------------------------------------------
 
 
 def test_registration() -> None:
@@ -580,7 +580,7 @@ def test_bad_actions(name: str, actions: list[Any], way_out: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_step_and_render_want_a_reset_first(name: str) -> None:
+def test_step_and_render_need_a_reset_first(name: str) -> None:
     env = make(name, render_mode="rgb_array")
     with pytest.raises(ResetNeeded, match=r"reset\(\) before step"):
         env.step(env.action_space.sample())

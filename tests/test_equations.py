@@ -1,8 +1,7 @@
 """The package against `examples/knn_td_from_scratch.py`: the same perceptions, the same choices, the same table.
 
-A run is recorded at the border between learner and environments and replayed through the reference with
-the actions that were taken. A greedy run must also be one the reference would have chosen by itself, step for
-step.
+A run is recorded at the interface between learner and environments, and replayed through the reference with the
+recorded actions. In a greedy run the reference must also select the same action in every step.
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "torch kd_tree": {"search": "kd_tree", "policy_kwargs": {"compiled": False}},
     "compiled kd_tree": {"search": "kd_tree"},
 }
-# A variant that serves only some kinds of points, spaces or weights names them here: "lattice", "scattered",
-# "discrete", "inverse_quadratic", "gaussian", "callable". The others serve all.
+# A variant that supports only some kinds of points, spaces or weights lists them here: "lattice", "scattered",
+# "discrete", "inverse_quadratic", "gaussian", "callable". The others support all.
 SERVES: dict[str, set[str]] = {
     "torch lattice": {"lattice", "inverse_quadratic", "gaussian", "callable"},
     "compiled brute": {"lattice", "scattered", "discrete", "inverse_quadratic", "gaussian"},
@@ -62,7 +61,7 @@ LEARNERS: dict[str, list[str]] = {
 }
 
 DRIFT_BOUNDS = (DriftEnv.LOW, DriftEnv.HIGH)
-# 40 points that lie nowhere near a lattice, some of them outside the bounds.
+# 40 irregular points, some of them outside the bounds.
 SCATTERED = np.random.default_rng(5).uniform(
     DriftEnv.LOW - 0.05 * (DriftEnv.HIGH - DriftEnv.LOW), DriftEnv.HIGH, size=(40, 2)
 )
@@ -72,12 +71,12 @@ EnvMaker = Callable[[], gym.Env[Any, Any]]
 
 
 def variants(*needs: str) -> list[str]:
-    """The names of all variants that serve what is asked."""
+    """The names of all variants that support the requirements."""
     return [name for name in VARIANTS if all(name not in SERVES or need in SERVES[name] for need in needs)]
 
 
 def learners(*needs: str) -> list[str]:
-    """The names of those that learn in different ways; the first need is the kind of points or space."""
+    """The names of the variants that learn in different ways; the first requirement is the kind of points or space."""
     return [name for name in variants(*needs) if name in LEARNERS[needs[0]]]
 
 
@@ -90,7 +89,7 @@ LEARNING_ON_POINTS = [(variant, kind) for kind in POINTS for variant in learners
 
 
 def make_model(env: Any, variant: str, **arguments: Any) -> KNNTD:
-    """A model that leaves nothing to a default, for defaults are free to change."""
+    """A model without default arguments, because defaults may change."""
     chosen: dict[str, Any] = {
         "learning_rate": 0.5,
         "gamma": 0.5,
@@ -109,13 +108,13 @@ def make_model(env: Any, variant: str, **arguments: Any) -> KNNTD:
         "seed": 0,
     }
     chosen.update(arguments)
-    # Both may have a say in the policy's own arguments.
+    # Both may contain policy_kwargs.
     policy_kwargs = {**chosen.pop("policy_kwargs", {}), **VARIANTS[variant].get("policy_kwargs", {})}
     return KNNTD(env=env, **{**chosen, **VARIANTS[variant], "policy_kwargs": policy_kwargs})
 
 
 def record(makers: Sequence[EnvMaker], n_steps: int, variant: str, **arguments: Any) -> tuple[KNNTD, RecordingVecEnv]:
-    """A model that has learned for ``n_steps``, and what passed between it and its environments."""
+    """A model trained for ``n_steps``, and the record of its interaction with the environments."""
     venv = RecordingVecEnv(DummyVecEnv(list(makers)))
     model = make_model(venv, variant, **arguments)
     model.learn(n_steps)
@@ -142,7 +141,7 @@ def make_reference(
     policy_kwargs: Any = None,
     **perception: Any,
 ) -> KNNTDAgent:
-    """The reference for the same arguments; those of time go to `rates_at`, those of precision nowhere."""
+    """The reference for the same arguments; time-dependent ones are handled by `rates_at`, the precision is ignored."""
     return KNNTDAgent(
         make_perceiver(venv.observation_space, **perception),
         int(venv.action_space.n),  # type: ignore[attr-defined]
@@ -158,7 +157,7 @@ def make_reference(
 
 
 def rates_at(progress_remaining: float, arguments: dict[str, Any]) -> Rates:
-    """The rates that belong to a moment, from numbers or from schedules."""
+    """The rates at a step, from numbers or schedules."""
 
     def now(value: Any) -> float:
         return float(value(progress_remaining) if callable(value) else value)
@@ -177,7 +176,7 @@ def rates_at(progress_remaining: float, arguments: dict[str, Any]) -> Rates:
 
 
 def transitions(steps: Sequence[VecStep]) -> Iterator[list[Transition]]:
-    """A record as the reference takes it; the action after an episode's end or the record's is left open."""
+    """A record as transitions of the reference; the action after the end of an episode or of the record is open."""
     for number, step in enumerate(steps):
         together = []
         for env in range(len(step.actions)):
@@ -200,8 +199,8 @@ def transitions(steps: Sequence[VecStep]) -> Iterator[list[Transition]]:
 def replay(venv: RecordingVecEnv, n_steps: int, *, greedy: bool, **arguments: Any) -> KNNTDAgent:
     """The reference after the recorded steps.
 
-    :param greedy: the run did not explore, so each recorded action must be the reference's own; it is chosen
-        with the table as it is when the observation arrives, before the step that led there is learned from
+    :param greedy: whether the run did not explore, so that the reference must select each recorded action; it selects
+        with the table at the time of the observation, before the update by the step that led there
     """
     learner = make_reference(venv, **arguments)
     steps = list(transitions(venv.steps))
@@ -228,7 +227,7 @@ def set_table(model: KNNTD, values: np.ndarray) -> None:
 
 def assert_same_table(model: KNNTD, learner: KNNTDAgent, tolerance: float = 1e-9) -> None:
     got, expected = table(model), learner.q_table
-    # Equal tables are no evidence where nothing was learned or everything ran away.
+    # Equal tables prove nothing if nothing was learned or the values diverged.
     assert np.isfinite(expected).all()
     assert 1e-3 < np.abs(expected - expected.flat[0]).max() < 1e6
     assert got.shape == expected.shape
@@ -244,7 +243,7 @@ def check(
     tolerance: float = 1e-9,
     **arguments: Any,
 ) -> RecordingVecEnv:
-    """Record, replay, compare; the record is returned for what a test wants to know besides."""
+    """Record, replay and compare; returns the record for further checks."""
     model, venv = record(makers, n_steps, variant, **arguments)
     learner = replay(venv, n_steps, greedy=greedy, **arguments)
     assert_same_table(model, learner, tolerance)
@@ -252,7 +251,7 @@ def check(
 
 
 def drift(**arguments: Any) -> dict[str, Any]:
-    """Arguments for DriftEnv, with some of them changed."""
+    """Arguments of DriftEnv, with some of them changed."""
     base = {
         "learning_rate": 0.2,
         "gamma": 0.97,
@@ -282,7 +281,7 @@ def test_same_table(
     traces: str,
     target: str,
 ) -> None:
-    # Accumulating traces of a long memory overshoot at a larger step, and then rounding decides.
+    # With a larger step size long accumulating traces overshoot, and the result depends on rounding.
     learning_rate = 0.05 if traces == "accumulating" else 0.3
     arguments = drift(
         learning_rate=learning_rate,
@@ -301,7 +300,7 @@ def test_same_table(
 
 @pytest.mark.parametrize(("variant", "points"), ON_POINTS)
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_every_search_serves_learning(variant: str, points: str, n_envs: int) -> None:
+def test_every_search_supports_learning(variant: str, points: str, n_envs: int) -> None:
     makers = [lambda n=n: DriftEnv(offset=0.3 * n) for n in range(n_envs)]
     check(makers, 300, variant, **drift(points=POINTS[points]))
 
@@ -311,7 +310,7 @@ def test_every_search_serves_learning(variant: str, points: str, n_envs: int) ->
 @pytest.mark.parametrize("traces", ["replacing", "accumulating"])
 @pytest.mark.parametrize("epsilon", [0.0, 0.5])
 def test_reset_other_actions(variant: str, reset_other_actions: bool, traces: str, epsilon: float) -> None:
-    # Q-learning, so that no action that was chosen but never taken has a part in it.
+    # Q-learning, so that actions that were selected but never taken do not matter.
     check(
         [DriftEnv],
         300,
@@ -330,7 +329,7 @@ def test_reset_other_actions(variant: str, reset_other_actions: bool, traces: st
 
 
 @pytest.mark.parametrize("variant", learners("lattice"))
-def test_reset_other_actions_speaks_of_replacing_traces(variant: str) -> None:
+def test_reset_other_actions_needs_replacing_traces(variant: str) -> None:
     def learned(traces: str, reset: bool) -> np.ndarray:
         arguments = drift(traces=traces, reset_other_actions=reset, trace_decay=0.95, learning_rate=0.1)
         return table(record([DriftEnv], 300, variant, **arguments)[0])
@@ -340,7 +339,7 @@ def test_reset_other_actions_speaks_of_replacing_traces(variant: str) -> None:
 
 
 def sharp(squared: Any) -> Any:
-    """A weight of a user's own, for whatever array it is given."""
+    """A user-defined weight function for arrays of any type."""
     return 1.0 / (0.02 + squared)
 
 
@@ -367,14 +366,14 @@ def test_weights(variant: str, points: str, weights: Any, bandwidth: float) -> N
 @pytest.mark.parametrize("target", ["sarsa", "q_learning", "expected_sarsa"])
 @pytest.mark.parametrize("initial_value", [2.0, -20.0])
 def test_initial_value(variant: str, target: str, initial_value: float) -> None:
-    # Two values of an action that no step has told apart are equal but for rounding, so the choices are only
-    # replayed. `test_equal_values_are_a_tie` sees to ties.
+    # Action values that no step has distinguished are equal up to rounding, so the choices are only
+    # replayed. `test_equal_values_are_a_tie` tests ties.
     arguments = drift(target=target, initial_value=initial_value, exploration_initial_eps=0.0)
     check([lambda: DriftEnv(lengths=(25,), ends=("terminated",))], 300, variant, greedy=False, **arguments)
 
 
 class ManyActionsEnv(DriftEnv):
-    """Seven actions: enough for a vectorised sum to treat the last of them differently."""
+    """Seven actions, so that a vectorised sum treats the last ones differently."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -394,7 +393,7 @@ def test_equal_values_are_a_tie(variant: str, points: str, initial_value: float)
 
 @pytest.mark.parametrize("variant", learners("lattice"))
 def test_single_precision(variant: str) -> None:
-    # Rounding may break a near tie, so the choices are only replayed.
+    # Rounding may break near ties, so the choices are only replayed.
     makers = [lambda: DriftEnv(lengths=(25,), ends=("terminated",))]
     arguments = drift(policy_kwargs={"dtype": torch.float32})
     model, venv = record(makers, 300, variant, **arguments)
@@ -406,7 +405,7 @@ def test_single_precision(variant: str) -> None:
 @pytest.mark.parametrize("traces", ["replacing", "accumulating"])
 def test_a_table_of_the_visited_points_only(n_envs: int, traces: str) -> None:
     arguments = drift(policy_kwargs={"table": "hashed"}, traces=traces, learning_rate=0.1, initial_value=-3.0)
-    # Episodes that end together with the record: no action is chosen and not taken.
+    # The last episode ends with the record, so that every selected action is taken.
     makers = [lambda n=n: DriftEnv(offset=0.3 * n, lengths=(25,), ends=("terminated",)) for n in range(n_envs)]
     model, venv = record(makers, 300 * n_envs, "compiled lattice", **arguments)
     learner = replay(venv, 300 * n_envs, greedy=False, **arguments)
@@ -426,7 +425,7 @@ def test_double_precision_unless_asked_otherwise(variant: str) -> None:
 @pytest.mark.parametrize("end", ["terminated", "truncated", "both"])
 @pytest.mark.parametrize("target", ["sarsa", "q_learning", "expected_sarsa"])
 def test_ends_of_episodes(variant: str, end: str, target: str) -> None:
-    # Episodes of one step too: there the end comes before anything was perceived twice.
+    # Include episodes of one step, which end before anything is perceived twice.
     makers = [lambda: DriftEnv(lengths=(1, 5, 2, 17), ends=(end,))]
     check(makers, 200, variant, **drift(target=target, trace_decay=0.9))
 
@@ -434,7 +433,7 @@ def test_ends_of_episodes(variant: str, end: str, target: str) -> None:
 @pytest.mark.parametrize("variant", learners("lattice"))
 @pytest.mark.parametrize("end", ["terminated", "truncated"])
 def test_gamma_one_and_a_long_episode(variant: str, end: str) -> None:
-    # Traces that never fade for hundreds of steps, or fade to less than rounding and far beyond.
+    # Traces that do not decay for hundreds of steps, or decay far below rounding.
     for trace_decay in (1.0, 0.7):
         makers = [lambda: DriftEnv(lengths=(700,), ends=(end,))]
         check(makers, 1000, variant, **drift(gamma=1.0, trace_decay=trace_decay, learning_rate=0.05))
@@ -442,7 +441,7 @@ def test_gamma_one_and_a_long_episode(variant: str, end: str) -> None:
 
 @pytest.mark.parametrize("variant", learners("lattice"))
 @pytest.mark.parametrize("gamma", [0.0, 0.5])
-def test_short_sight(variant: str, gamma: float) -> None:
+def test_small_gamma(variant: str, gamma: float) -> None:
     check([DriftEnv], 300, variant, **drift(gamma=gamma, trace_decay=1.0))
 
 
@@ -450,7 +449,7 @@ def test_short_sight(variant: str, gamma: float) -> None:
 @pytest.mark.parametrize("traces", ["replacing", "accumulating"])
 @pytest.mark.parametrize("target", ["sarsa", "q_learning", "expected_sarsa"])
 def test_learning_in_two_calls_is_learning_in_one(variant: str, traces: str, target: str) -> None:
-    # The second call goes on in the middle of an episode, with its traces and with the action chosen already.
+    # The second call continues in the middle of an episode, with its traces and the selected action.
     arguments = drift(traces=traces, target=target, trace_decay=0.9, learning_rate=0.1)
     venv = RecordingVecEnv(DummyVecEnv([DriftEnv]))
     model = make_model(venv, variant, **arguments)
@@ -501,7 +500,7 @@ def test_finite_spaces_with_several_envs(variant: str, kind: str) -> None:
 @pytest.mark.parametrize("dtype", [np.int64, np.int32, np.int8, np.uint8])
 @pytest.mark.parametrize("n_neighbors", [1, 2, 4, 7])
 def test_integer_observations(variant: str, dtype: Any, n_neighbors: int) -> None:
-    # Lattice planes two cells apart: half of all observations lie exactly between points, at equal distances.
+    # Lattice planes are two cells apart: half of all observations are exactly between points, at equal distances.
     arguments: dict[str, Any] = {
         "learning_rate": 0.2,
         "gamma": 0.95,
@@ -516,7 +515,7 @@ def test_integer_observations(variant: str, dtype: Any, n_neighbors: int) -> Non
 
 @pytest.mark.parametrize("variant", learners("scattered"))
 def test_integer_observations_on_scattered_points(variant: str) -> None:
-    # Points at half-way cells, so that every observation has neighbours at equal distances.
+    # Points half-way between cells, so that every observation has neighbours at equal distances.
     points = np.array([[x + 0.5, y + 0.5] for x in range(0, 8, 2) for y in range(0, 4, 2)])
     arguments: dict[str, Any] = {
         "learning_rate": 0.2,
@@ -561,7 +560,7 @@ def test_schedules(variant: str, n_envs: int, scheduled: dict[str, Any]) -> None
 @pytest.mark.parametrize("traces", ["replacing", "accumulating"])
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_exploration(variant: str, target: str, traces: str, n_envs: int) -> None:
-    # An exploratory action cuts no traces. The expectation follows the schedule of epsilon.
+    # Exploratory actions do not cut traces. The expectation uses the scheduled epsilon.
     makers = [lambda n=n: DriftEnv(offset=0.3 * n) for n in range(n_envs)]
     venv = check(
         makers,
@@ -586,7 +585,7 @@ def test_exploration(variant: str, target: str, traces: str, n_envs: int) -> Non
 @pytest.mark.parametrize("target", ["sarsa", "q_learning", "expected_sarsa"])
 @pytest.mark.parametrize("temperature", [0.5, falling])
 def test_softmax(variant: str, target: str, temperature: Any) -> None:
-    # All episodes end by termination, the last of them with the record: no action is chosen and not taken.
+    # All episodes terminate, the last one with the record, so that every selected action is taken.
     check(
         [lambda: DriftEnv(lengths=(7, 13), ends=("terminated",))],
         300,
@@ -598,8 +597,8 @@ def test_softmax(variant: str, target: str, temperature: Any) -> None:
 
 @pytest.mark.parametrize("variant", learners("lattice"))
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_sarsa_learns_from_the_action_it_will_take(variant: str, n_envs: int) -> None:
-    # As above: after a termination no action has a part in the target, whatever is chosen next.
+def test_sarsa_learns_from_the_next_action(variant: str, n_envs: int) -> None:
+    # As above: after a termination the target does not depend on the next action.
     makers = [
         lambda length=length, n=n: DriftEnv(offset=0.3 * n, lengths=(length,), ends=("terminated",))
         for n, length in enumerate((25, 10, 50)[:n_envs])
@@ -609,12 +608,12 @@ def test_sarsa_learns_from_the_action_it_will_take(variant: str, n_envs: int) ->
 
 
 @pytest.mark.parametrize("variant", learners("lattice"))
-def test_sarsa_at_a_truncation_explores_like_anywhere(variant: str) -> None:
-    # The action chosen at the last observation is never taken, so the record does not tell it. Exactly one
-    # assignment of actions to these moments must explain the table, and it must not always be the greedy one.
+def test_sarsa_at_a_truncation_uses_an_exploratory_action(variant: str) -> None:
+    # The action selected at the last observation is never taken, so it is not in the record. Exactly one
+    # assignment of actions to these steps must explain the table, and it must not always be the greedy one.
     explored = 0
     arguments = drift(exploration_initial_eps=1.0, exploration_final_eps=1.0, learning_rate=0.5)
-    # No two values alike, so that no two assignments give the same table.
+    # All values differ, so that different assignments give different tables.
     start = np.random.default_rng(4).normal(size=(48, 3))
     for seed in range(3):
         ends = ("truncated", "terminated", "truncated", "truncated")
@@ -645,7 +644,7 @@ def test_sarsa_at_a_truncation_explores_like_anywhere(variant: str) -> None:
 
 
 def unequal_drifts(n_envs: int) -> list[EnvMaker]:
-    """Environments out of step; the first ends much earlier than the others, the last hardly ever."""
+    """Environments with different episode lengths: very short ones in the first, very long ones in the last."""
     lengths = [(3,), *[(9 + n, 14 - n) for n in range(n_envs - 2)], (40,)]
     ends = [("terminated", "truncated"), ("truncated", "terminated", "both")]
     return [
@@ -698,7 +697,7 @@ def test_envs_share_one_table_and_explore(variant: str, target: str, reset_other
 @pytest.mark.parametrize("variant", learners("lattice"))
 @pytest.mark.parametrize("traces", ["replacing", "accumulating"])
 def test_equal_envs_learn_as_one(variant: str, traces: str) -> None:
-    # Eight copies of one environment know no more than one, and must not take a larger step.
+    # Eight copies of one environment have the same information as one, and must not make a larger update.
     arguments = drift(traces=traces, learning_rate=0.1)
     one, _ = record([DriftEnv], 200, variant, **arguments)
     eight, _ = record([DriftEnv] * 8, 1600, variant, **arguments)
@@ -782,8 +781,8 @@ def test_normalized_step_by_hand(variant: str) -> None:
 @pytest.mark.parametrize("variant", learners("lattice"))
 def test_two_envs_by_hand(variant: str) -> None:
     # One environment sees 1 and ends with r = 1, the other sees 3 and ends with r = 3; alpha = 1/2. Their
-    # traces are (1/2, 1/2, 0) and (0, 1/2, 1/2). The outer points know one error each: 1/2 * 1 * 1/2 and
-    # 1/2 * 3 * 1/2. The middle one knows both: alpha * mean error * largest trace = 1/2 * 2 * 1/2.
+    # traces are (1/2, 1/2, 0) and (0, 1/2, 1/2). The outer points get one error each: 1/2 * 1 * 1/2 and
+    # 1/2 * 3 * 1/2. The middle one gets both: alpha * mean error * largest trace = 1/2 * 2 * 1/2.
     makers: list[EnvMaker] = [
         lambda: ScriptedEnv([[1.0], [2.0]], [1.0], end="terminated"),
         lambda: ScriptedEnv([[3.0], [2.0]], [3.0], end="terminated"),
@@ -820,7 +819,7 @@ def expected_perception(perceive: Any, observations: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("n_neighbors", [1, 2, 5, 16, 40])
 @pytest.mark.parametrize("n_rows", [1, 24, 200])
 def test_same_perception(variant: str, points: str, n_neighbors: int, n_rows: int) -> None:
-    # Many rows at once take other paths through the libraries than a few.
+    # The libraries use other code paths for many rows than for a few.
     arguments: dict[str, Any] = {"points": POINTS[points], "bounds": DRIFT_BOUNDS, "n_neighbors": n_neighbors}
     model = make_model(DriftEnv(), variant, **arguments)
     span = DriftEnv.HIGH - DriftEnv.LOW
@@ -853,7 +852,7 @@ def test_equal_distances_go_to_the_lower_index(variant: str, n_neighbors: int, s
 @pytest.mark.parametrize("variant", variants("scattered"))
 @pytest.mark.parametrize("n_neighbors", [1, 3, 8])
 def test_equal_distances_among_scattered_points(variant: str, n_neighbors: int) -> None:
-    # A shuffled lattice has its points at the same places under other indices, and some are there twice.
+    # A shuffled lattice has the same points under other indices, and some of them twice.
     points = 4.0 * (lattice((5, 3)) + 1.0)
     points = np.concatenate([points, points[::3]])[np.random.default_rng(2).permutation(20)]
     arguments: dict[str, Any] = {"points": points, "bounds": (np.zeros(2), np.full(2, 8.0)), "n_neighbors": n_neighbors}
@@ -869,8 +868,8 @@ def test_equal_distances_among_scattered_points(variant: str, n_neighbors: int) 
 @pytest.mark.parametrize("shape", [(4, 7), (6, 11, 4), (20, 15)])
 @pytest.mark.parametrize("n_neighbors", [1, 4, 9])
 def test_no_nearer_point_is_missed(variant: str, shape: tuple[int, ...], n_neighbors: int) -> None:
-    # Where the lattice planes are not exact in binary, rounding may tell equal distances apart, and either
-    # choice is right; the distances themselves may not differ.
+    # If lattice planes are not exact in binary, rounding may distinguish equal distances, and either
+    # choice is correct; the distances themselves must agree.
     d = len(shape)
     low, high = -np.arange(1.0, d + 1), np.arange(0.3, d)
     arguments: dict[str, Any] = {"points": shape, "bounds": (low, high), "n_neighbors": n_neighbors}
@@ -910,7 +909,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def random_points(rng: np.random.Generator) -> tuple[int, np.ndarray, int]:
-    """Dimensions, scattered points in [-1, 1]^d, and a number of neighbours that they allow."""
+    """Dimensions, scattered points in [-1, 1]^d, and a valid number of neighbours."""
     d = int(rng.integers(1, 5))
     points = rng.uniform(-1.0, 1.0, size=(int(rng.integers(1, 30)), d))
     return d, points, int(rng.integers(1, len(points) + 1))
@@ -928,7 +927,7 @@ def still_model(variant: str, d: int, points: Any, n_neighbors: int, **arguments
 @given(seed=SEEDS, bandwidth=st.floats(0.01, 10.0), reach=st.sampled_from([1.0, 3.0, 100.0]))
 @PROPERTY
 def test_probabilities(variant: str, weights: str, seed: int, bandwidth: float, reach: float) -> None:
-    # Far outside the bounds a gaussian weight is smaller than any float; what is nearest is still nearest.
+    # Far outside the bounds Gaussian weights underflow; the nearest point must still be the nearest.
     rng = np.random.default_rng(seed)
     d, points, k = random_points(rng)
     model = still_model(variant, d, points, k, weights=weights, bandwidth=bandwidth)
@@ -943,7 +942,7 @@ def test_probabilities(variant: str, weights: str, seed: int, bandwidth: float, 
 @pytest.mark.parametrize("variant", variants("scattered"))
 @given(seed=SEEDS)
 @PROPERTY
-def test_the_order_of_points_is_only_a_name(variant: str, seed: int) -> None:
+def test_the_order_of_points_does_not_matter(variant: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     d, points, k = random_points(rng)
     order = rng.permutation(len(points))
@@ -1031,7 +1030,7 @@ def test_a_full_step_removes_the_error(variant: str, end: str, target: str, seed
     np.testing.assert_array_equal(np.delete(after, action), np.delete(before[0], action))
 
 
-def test_toy_episodes_end_as_told() -> None:
+def test_toy_episodes_end_as_specified() -> None:
     env: EpisodeEnv = DriftEnv(lengths=(2, 1), ends=("terminated", "truncated", "both"))
     ends = []
     for _ in range(3):

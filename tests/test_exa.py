@@ -1,4 +1,4 @@
-"""Ex⟨a⟩(λ): the table against `examples/exa_from_scratch.py`, and what it alone has; the rest is tested over both."""
+"""Ex⟨a⟩(λ): the table against `examples/exa_from_scratch.py`, and features that only ExA has."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from toy_envs import DriftEnv, PushEnv, RecordingVecEnv
 import sb3_knntd.envs  # noqa: F401  registers the paper's environments
 from sb3_knntd import KNNTD, ExA
 
-# Both ways to learn, as policy_kwargs.
+# Both learners, as policy_kwargs.
 LEARNERS: dict[str, dict[str, Any]] = {"torch": {"compiled": False}, "compiled": {}}
 BOUNDS = (DriftEnv.LOW, DriftEnv.HIGH)
 SCATTERED = np.random.default_rng(5).uniform(
     DriftEnv.LOW - 0.05 * (DriftEnv.HIGH - DriftEnv.LOW), DriftEnv.HIGH, size=(40, 2)
 )
 POINTS: dict[str, Any] = {"lattice": (8, 6), "scattered": SCATTERED}
-# No point is the mean of two others, so that an average is not mistaken for one of them.
+# No point is the mean of two others, so that a mean is distinguishable from a point.
 ONE = [[-1.0, -0.13, 0.71, 0.9]]
 TWO = [[-1.0, 0.37, 0.83], [0.11, 0.29]]
 
 
 def make_venv(n_envs: int = 1, **arguments: Any) -> DummyVecEnv:
-    """Pushed points whose episodes have 9, 14 and 6 steps, in turn."""
+    """Pushed points with episodes of 9, 14, 6, 9, ... steps."""
     return DummyVecEnv(
         [lambda n=index: Monitor(PushEnv(offset=0.3 * n, **arguments)) for index in range(n_envs)]  # type: ignore[misc]
     )
 
 
 def make_model(env: Any = None, **arguments: Any) -> ExA:
-    """A model that leaves little to a default, for defaults are free to change."""
+    """A model with few default arguments, because defaults may change."""
     chosen: dict[str, Any] = {
         "learning_rate": 0.2,
         "gamma": 0.97,
@@ -70,7 +70,7 @@ def table(model: ExA) -> np.ndarray:
 
 def set_random_table(model: ExA, seed: int) -> None:
     with th.no_grad():
-        # Few different values, so that there are ties too.
+        # Few different values, to have ties.
         values = np.random.default_rng(seed).integers(0, 6, size=model.policy.q_table.shape)
         model.policy.q_table.copy_(th.as_tensor(values))
 
@@ -86,8 +86,8 @@ def message_of(make: Callable[[], Any]) -> str:
 
 def explored(learner: ExAAgent, own: Choice, taken: np.ndarray) -> Choice:
     """
-    The choice behind an action of an environment that explores the same column for all neighbours: part by part the
-    column that the action lies on, or where it lies on none the one that each neighbour recommends.
+    The choice that gave an action with shared exploration: in each part the column of the action if it is an action
+    point, otherwise the columns that the neighbours recommend.
     """
     columns = own.columns.copy()
     for number, part in enumerate(learner.parts):
@@ -100,10 +100,10 @@ def explored(learner: ExAAgent, own: Choice, taken: np.ndarray) -> Choice:
 
 def replay(venv: RecordingVecEnv, learner: ExAAgent, rates: Rates, tolerance: float = 1e-9) -> tuple[ExAAgent, float]:
     """
-    The reference after the recorded steps; each recorded action must be the reference's own, chosen with the table
-    as it is when the observation arrives, or one that was explored.
+    The reference after the recorded steps. Each recorded action must be exploratory, or the one that the reference
+    selects with the table at the time of the observation.
 
-    :return: the reference, and the share of the choices that were explored
+    :return: the reference, and the share of exploratory choices
     """
     steps, n_explored, n_choices = venv.steps, 0, 0
 
@@ -151,7 +151,7 @@ def check(
     env: dict[str, Any] | None = None,
     **arguments: Any,
 ) -> RecordingVecEnv:
-    """Record, replay, compare; the record is returned for what a test wants to know besides."""
+    """Record, replay and compare; returns the record for further checks."""
     chosen = {
         "learning_rate": 0.2,
         "gamma": 0.97,
@@ -184,7 +184,7 @@ def check(
     reference = ExAAgent(perceive, lists, n_envs, factored=action_table == "factored", **chosen)
     reference, share = replay(venv, reference, rates)
     got, expected = table(model), reference.q_table
-    # Equal tables are no evidence where nothing was learned or everything ran away.
+    # Equal tables prove nothing if nothing was learned or the values diverged.
     assert 1e-3 < np.abs(expected - chosen["initial_value"]).max() < 1e6
     assert got.shape == expected.shape
     np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
@@ -196,7 +196,7 @@ def check(
 TRACES: dict[str, dict[str, Any]] = {
     "replacing, normalized": {},
     "replacing and clearing, paper": {"reset_other_actions": True, "step_size": "paper"},
-    # Accumulating traces of a long memory overshoot at a larger step, and then rounding decides.
+    # With a larger step size long accumulating traces overshoot, and the result depends on rounding.
     "accumulating, paper": {"traces": "accumulating", "step_size": "paper", "learning_rate": 0.05},
 }
 
@@ -231,7 +231,7 @@ def test_ends_of_episodes(learner: str, end: str) -> None:
 
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_one_environment_ends_early(learner: str) -> None:
-    """While two go on, one of three begins anew again and again."""
+    """One of three environments has very short episodes."""
     lengths = [(40,), (5, 3), (40,)]
     venv = RecordingVecEnv(
         DummyVecEnv([partial(PushEnv, offset=0.3 * n, lengths=each) for n, each in enumerate(lengths)])
@@ -250,7 +250,7 @@ def test_one_environment_ends_early(learner: str) -> None:
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("initial_value", [2.0, -20.0])
 def test_initial_value(learner: str, initial_value: float) -> None:
-    # With a small step no value comes back to where it was, and with one environment each is reached by one sum.
+    # With a small step size no value returns to its initial value; one environment gives a unique order of summation.
     check(learner, 60, initial_value=initial_value, trace_decay=0.5)
 
 
@@ -274,7 +274,7 @@ def test_a_table_of_the_visited_points_only(action_table: str) -> None:
 @pytest.mark.parametrize("tie_break", ["first", "random"])
 @pytest.mark.parametrize("action_table", ["joint", "factored"])
 def test_torch_and_compiled_draw_the_same(exploration: str, tie_break: str, action_table: str) -> None:
-    """The same random numbers mean the same to both, also where no reference can say what was drawn."""
+    """Both learners use random numbers in the same way, also where the reference does not define it."""
     venvs = [RecordingVecEnv(make_venv(2, shape=(2,))) for _ in LEARNERS]
     models = [
         make_model(
@@ -292,7 +292,7 @@ def test_torch_and_compiled_draw_the_same(exploration: str, tie_break: str, acti
 
 
 def explore_only(n_steps: int, seed: int = 0, **arguments: Any) -> np.ndarray:
-    """The actions of an environment that ends never, with ε = 1, shape (n_steps, action_dim)."""
+    """The actions in an environment without episode ends, with ε = 1, shape (n_steps, action_dim)."""
     shape = arguments.pop("shape", (1,))
     venv = RecordingVecEnv(make_venv(shape=shape, ends=("never",)))
     everything = {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0, "learning_rate": 0.0, "seed": seed}
@@ -307,10 +307,10 @@ def test_shared_exploration_holds_a_column(learner: str, hold: float) -> None:
     actions = explore_only(n, action_points=ONE, exploration_hold=hold, policy_kwargs=LEARNERS[learner])[:, 0]
     nearest = np.abs(actions[:, None] - np.array(ONE)).min(axis=1)
     assert nearest.max() < 1e-12
-    # All four are as likely; the count of draws is about n / hold.
+    # All four are equally likely; the number of draws is about n / hold.
     shares = [np.mean(np.abs(actions - point) < 1e-12) for point in ONE[0]]
     np.testing.assert_allclose(shares, 0.25, atol=4 * math.sqrt(0.19 * 2 * hold / n))
-    # A draw falls on the same column in one of four cases, and no change is to be seen then.
+    # One of four draws gives the same column, which is not visible as a change.
     changes = np.mean(np.abs(np.diff(actions)) > 1e-9)
     expected = 0.75 / hold
     assert changes == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / n))
@@ -318,11 +318,11 @@ def test_shared_exploration_holds_a_column(learner: str, hold: float) -> None:
 
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_by_itself_exploration_holds_for_a_fiftieth_of_an_episode(learner: str, n_envs: int) -> None:
-    """As many draws as expected, by what the lengths of the episodes so far say at each step."""
+def test_default_exploration_hold_is_one_fiftieth_of_an_episode(learner: str, n_envs: int) -> None:
+    """The number of draws is as expected from the episode lengths so far."""
     lengths, n_steps = (400, 30, 1200, 300), 4000
     venv = RecordingVecEnv(make_venv(n_envs, lengths=lengths))
-    # Of so many columns hardly any is drawn twice in a row.
+    # With so many columns the same one is rarely drawn twice in a row.
     make_model(
         venv, action_points=500, exploration_initial_eps=1.0, exploration_final_eps=1.0, exploration_hold="auto",
         learning_rate=0.0, policy_kwargs=LEARNERS[learner],
@@ -348,14 +348,14 @@ def test_factored_exploration_draws_each_dimension() -> None:
     actions = explore_only(2000, exploration_hold=1.0, **arguments)
     seen = {tuple(action) for action in np.round(actions, 9).tolist()}
     assert seen == {(x, y) for x in TWO[0] for y in TWO[1]}
-    # Both are held together, and drawn together.
+    # Both are drawn at the same time, and persist for the same time.
     held = explore_only(500, exploration_hold=50.0, **arguments)
     assert np.any(np.abs(np.diff(held, axis=0)) > 1e-9, axis=1).mean() < 0.06
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_an_episode_begins_with_a_draw(learner: str) -> None:
-    """Held for practically ever: constant within an episode, and not from one to the next."""
+def test_an_episode_starts_with_a_new_draw(learner: str) -> None:
+    """With a very long hold: constant within an episode, and different between episodes."""
     venv = RecordingVecEnv(make_venv())
     make_model(
         venv, action_points=ONE, exploration_initial_eps=1.0, exploration_final_eps=1.0, exploration_hold=1e12,
@@ -374,7 +374,7 @@ def test_an_episode_begins_with_a_draw(learner: str) -> None:
 def test_neighbors_that_explore_by_themselves_average_out(learner: str) -> None:
     arguments: dict[str, Any] = {"exploration": "per_neighbor", "policy_kwargs": LEARNERS[learner]}
     few, many = (explore_only(800, n_neighbors=k, **arguments)[:, 0] for k in (1, 9))
-    # One neighbour: points of the list, each as often; nine: about a third of the spread, and means of their own.
+    # One neighbour: all action points, equally often. Nine: about a third of the spread, and other values.
     assert {round(float(action), 9) for action in few} == {-1.0, 0.0, 1.0}
     assert few.std() == pytest.approx(math.sqrt(2 / 3), abs=0.06)
     assert many.std() < 0.5 * few.std()
@@ -391,7 +391,7 @@ def test_no_exploration_at_epsilon_zero() -> None:
 
 BOXES: dict[str, dict[str, Any]] = {
     "float32": {"shape": (1,), "low": -2.0, "high": 2.0, "dtype": np.float32},
-    # Bounds that no float32 hits.
+    # Bounds that float32 cannot represent.
     "odd bounds": {"shape": (2,), "low": -0.1, "high": 0.7, "dtype": np.float32},
     "matrix": {"shape": (2, 2), "dtype": np.float32},
     "float64": {"shape": (3,), "low": 1.1, "high": 3.3},
@@ -414,7 +414,7 @@ def test_actions_lie_in_the_space(learner: str, box: dict[str, Any], action_tabl
     )
     def all_within(seed: int, places: list[tuple[float, float]]) -> None:
         set_random_table(model, seed)
-        # What has been recommended at one place must be so in a batch.
+        # Single and batched recommendations must be equal.
         observations = np.array(places, dtype=np.float32)
         for deterministic in (True, False):
             actions, _ = model.predict(observations, deterministic=deterministic)
@@ -426,13 +426,13 @@ def test_actions_lie_in_the_space(learner: str, box: dict[str, Any], action_tabl
         np.testing.assert_array_equal(single, model.predict(observations, deterministic=True)[0][0])
 
     all_within()
-    # PushEnv asserts that it is given what its space contains.
+    # PushEnv asserts that its actions are in the action space.
     model.learn(60)
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_all_neighbours_at_the_edge_stay_within_the_space(learner: str) -> None:
-    # Probabilities that sum to 1 + 1e-16 must not push an action over the edge, nor pull one away from it.
+    # Probabilities that sum to 1 + 1e-16 must move an action neither out of the space nor away from its edge.
     model = make_model(make_venv(low=-0.3, high=0.3), n_neighbors=9, policy_kwargs=LEARNERS[learner])
     with th.no_grad():
         model.policy.q_table[:, -1] = 1.0
@@ -474,14 +474,14 @@ POLICY_VENV = make_venv()
 
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("action_table", ["joint", "factored"])
-def test_recommendation_is_the_references(learner: str, action_table: str) -> None:
+def test_recommendation_equals_the_reference(learner: str, action_table: str) -> None:
     model = make_model(
         make_venv(shape=(2,)), action_points=TWO, action_table=action_table, policy_kwargs=LEARNERS[learner]
     )
     set_random_table(model, 1)
     reference = ExAAgent(NearestPoints((8, 6), BOUNDS, 4), TWO, factored=action_table == "factored")
     ends = np.cumsum([part.shape[0] for part in reference.parts])[:-1]
-    # Its ties go to the first, as those of deterministic predictions must whatever tie_break says.
+    # Its ties go to the first column, as in deterministic predictions with any tie_break.
     reference.tables = np.split(table(model), ends, axis=1)
     observations = np.random.default_rng(0).uniform(*BOUNDS, size=(100, 2)).astype(np.float32)
     expected = [reference.action(reference.recommend(observation)) for observation in observations]
@@ -491,10 +491,10 @@ def test_recommendation_is_the_references(learner: str, action_table: str) -> No
     )
 
 
-def test_random_ties_are_each_neighbours_own() -> None:
+def test_random_ties_are_drawn_per_neighbour() -> None:
     model = make_model(make_venv(), n_neighbors=9, tie_break="random")
     model.exploration_rate = 0.0
-    # Every column is as good: deterministic the lowest, else an average of draws.
+    # All columns are equal: the first one if deterministic, else a mean of draws.
     observations = np.zeros((400, 2), dtype=np.float32)
     assert set(model.predict(observations, deterministic=True)[0].ravel().tolist()) == {-1.0}
     drawn = model.predict(observations, deterministic=False)[0].ravel()
@@ -508,7 +508,7 @@ def test_prediction_explores_at_the_present_rate() -> None:
     for rate in (0.0, 0.5, 1.0):
         model.exploration_rate = rate
         actions = model.predict(observations, deterministic=False)[0].ravel()
-        # The greedy one is drawn too, one time in three.
+        # The greedy one is also drawn, one time in three.
         assert np.mean(actions > -0.9) == pytest.approx(rate * 2 / 3, abs=0.05)
 
 
@@ -541,8 +541,8 @@ def test_joint_while_it_is_small(dims: int, n_columns: int) -> None:
     assert model.policy.q_table.shape == (48, n_columns)
 
 
-def test_an_end_of_the_space_that_no_float32_hits_is_a_point() -> None:
-    # The space's own 0.7 is 0.699999988, which nobody writes.
+def test_a_limit_that_float32_rounds_is_a_valid_action_point() -> None:
+    # The limit 0.7 of the space is 0.699999988 in float32.
     model = make_model(make_venv(low=-0.7, high=0.7, dtype=np.float32), action_points=[[-0.7, 0.0, 0.7]])
     np.testing.assert_allclose(model.policy.action_points[0].numpy(), [-0.7, 0.0, 0.7], rtol=1e-6)
     assert "must lie within" in message_of(
@@ -551,14 +551,14 @@ def test_an_end_of_the_space_that_no_float32_hits_is_a_point() -> None:
 
 
 def test_hundreds_of_action_dimensions() -> None:
-    # More combinations than the largest float.
+    # More combinations than a float can represent.
     assert make_model(make_venv(shape=(700,))).policy.q_table.shape == (48, 2100)
     assert "'factored'" in message_of(lambda: make_model(make_venv(shape=(700,)), action_table="joint"))
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_whole_numbers_are_rounded(learner: str) -> None:
-    """Neighbours who all say 10 mean 10, also where their probabilities sum to a hair less than 1."""
+    """If all neighbours recommend 10, the action is 10, even if their probabilities sum to slightly less than 1."""
     model = make_model(make_venv(low=0, high=10, dtype=np.int64), n_neighbors=9, policy_kwargs=LEARNERS[learner])
     with th.no_grad():
         model.policy.q_table[:, -1] = 1.0
@@ -590,7 +590,7 @@ def test_interrupted_run_equals_the_uninterrupted(
 ) -> None:
     arguments = {"policy_kwargs": LEARNERS[learner], **given}
     venvs = [RecordingVecEnv(make_venv(n_envs, shape=(2,))) for _ in range(2)]
-    # In the middle of an episode, 101 being no sum of the episodes' lengths.
+    # In the middle of an episode, because 101 is not a sum of episode lengths.
     whole = make_model(venvs[0], **arguments).learn(101 * n_envs).learn(100, reset_num_timesteps=False)
     make_model(venvs[1], **arguments).learn(101 * n_envs).save(tmp_path / "middle")
     resumed = ExA.load(tmp_path / "middle", env=venvs[1], force_reset=False).learn(100, reset_num_timesteps=False)
@@ -603,7 +603,7 @@ def test_interrupted_run_equals_the_uninterrupted(
 
 
 def test_a_file_goes_from_one_learner_to_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was held is kept, in the middle of an episode, when numba is no longer to be had."""
+    """The persistent action is kept in the middle of an episode, if numba is no longer available."""
     venvs = [make_venv(2) for _ in range(2)]
     whole = make_model(venvs[0]).learn(90).learn(90, reset_num_timesteps=False)
     file = io.BytesIO()
@@ -636,7 +636,7 @@ def test_unbounded_observations_are_measured(learner: str, action_table: str) ->
         venv, bounds=None, points=5, action_points=TWO, action_table=action_table, policy_kwargs=LEARNERS[learner]
     ).learn(900)
     assert not model.policy.q_table.any()
-    # While it measures, all combinations of action points are tried, and nothing between them.
+    # While measuring, the actions are random action points, not means of them.
     assert {tuple(action) for step in venv.steps for action in np.round(step.actions, 9).tolist()} == {
         (x, y) for x in TWO[0] for y in TWO[1]
     }
@@ -705,7 +705,7 @@ def test_single_precision() -> None:
         ({"policy_kwargs": {"action_points": 5}}, ["policy_kwargs", "'action_points'"]),
     ],
 )
-def test_argument_value_and_what_would_do_are_named(arguments: dict[str, Any], says: list[str]) -> None:
+def test_error_names_argument_value_and_valid_values(arguments: dict[str, Any], says: list[str]) -> None:
     message = message_of(lambda: make_model(make_venv(shape=(2,)), **arguments))
     for words in says:
         assert words in message
@@ -735,8 +735,8 @@ def test_a_network_is_refused(policy: str) -> None:
 # ------------------------------------------------------------------------------------------- learning
 
 
-def test_pendulum_beats_chance() -> None:
-    """Chance is at about -1200."""
+def test_pendulum_is_better_than_random() -> None:
+    """Random actions have a return of about -1200."""
     returns = []
     for seed in range(3):
         model = ExA(

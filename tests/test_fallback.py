@@ -1,4 +1,4 @@
-"""Where numba cannot be used, or has nowhere to keep its results, everything still works, and says so."""
+"""Without a usable numba or a numba cache everything still works, with a warning."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PACKAGE = HERE.parent / "sb3_knntd"
 
 
 def learn(search: str = "auto", n_envs: int = 1, **arguments: Any) -> KNNTD:
-    """A run that does not depend on how it is computed: it acts on values that rounding does not make equal."""
+    """A run that does not depend on rounding: the action values are never nearly equal."""
     env = DummyVecEnv([lambda n=n: DriftEnv(offset=0.3 * n) for n in range(n_envs)])
     points: Any = (8, 6)
     if search in ("kd_tree", "hnsw"):
@@ -43,7 +43,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "environments": {"n_envs": 3, "traces": "accumulating", "learning_rate": 0.1},
 }
 
-# A process without numba: it learns what this one does, saves it, and tries what cannot be had.
+# A process without numba: it trains and saves the same models, and tries what needs numba.
 WITHOUT = """
 import json, sys, warnings
 with warnings.catch_warnings(record=True) as at_import:
@@ -104,17 +104,17 @@ def run_without(folder: pathlib.Path, **environment: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=["disabled", "broken"])
 def without(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What a process without numba reports, and why it has none."""
+    """The report of a process without numba, and the reason."""
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == "disabled":
         return {**run_without(folder, NUMBA_DISABLE_JIT="1"), "reason": "NUMBA_DISABLE_JIT"}
-    # A numba that does not fit the NumPy it finds raises this, and not only ImportError.
+    # A numba that is incompatible with the installed NumPy raises this instead of an ImportError.
     (folder / "numba").mkdir()
     (folder / "numba" / "__init__.py").write_text("raise SystemError('bad initialization')\n")
     return {**run_without(folder, PYTHONPATH=str(folder)), "reason": "bad initialization"}
 
 
-def test_a_warning_says_why(without: dict[str, Any]) -> None:
+def test_a_warning_gives_the_reason(without: dict[str, Any]) -> None:
     for run in without["runs"].values():
         assert len(run["warnings"]) == 1
         ((category, message),) = run["warnings"]
@@ -122,7 +122,7 @@ def test_a_warning_says_why(without: dict[str, Any]) -> None:
         assert message.startswith("numba cannot be used")
         assert without["reason"] in message
         assert "torch" in message
-    # Importing is not using, and who asks for torch operations has nothing to be told.
+    # No warning at import, nor if torch operations were requested.
     assert without["import"] == []
     assert without["asked for torch"] == []
 
@@ -137,7 +137,7 @@ def test_the_same_is_learned_by_torch_operations(without: dict[str, Any], name: 
     np.testing.assert_allclose(np.load(without["folder"] / f"{name}.npy"), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_files_go_either_way(without: dict[str, Any]) -> None:
+def test_files_are_interchangeable(without: dict[str, Any]) -> None:
     assert without["loaded"]
     assert len(without["actions"]) == 3
     model = KNNTD.load(without["folder"] / "model")
@@ -156,14 +156,14 @@ def test_hashed_tables_are_refused(without: dict[str, Any], table: str) -> None:
 NOWHERE = """
 import sb3_knntd, test_fallback as shared
 assert sb3_knntd.__file__.startswith({folder!r}), sb3_knntd.__file__
-# Without a cache all else would have to be compiled anew, which takes long.
+# Without a cache everything else would have to be compiled, which takes long.
 print(shared.learn(policy_kwargs={{"compiled": False}}).policy.q_table.sum().item())
 """
 
 
-def test_numba_has_nowhere_to_keep_its_results(tmp_path: pathlib.Path) -> None:
-    # As in a container whose file system is read-only and whose user has no home. numba says so when a function is
-    # decorated, at import; that must not be the end of the program.
+def test_numba_without_a_cache_folder(tmp_path: pathlib.Path) -> None:
+    # As in a container with a read-only file system and no home folder. numba raises an error when a function is
+    # decorated, at import; this must not end the program.
     shutil.copytree(PACKAGE, tmp_path / "sb3_knntd", ignore=shutil.ignore_patterns("__pycache__"))
     for folder in (tmp_path / "sb3_knntd").rglob("*"):
         if folder.is_dir():
@@ -209,19 +209,19 @@ def find_with(cache: pathlib.Path) -> str:
 
 
 def cut(content: bytes) -> bytes:
-    """The first half."""
+    """Truncate a file to its first half."""
     return content[: len(content) // 2]
 
 
 def flip(content: bytes) -> bytes:
-    """One bit in the middle is another."""
+    """Flip a bit in the middle of a file."""
     middle = len(content) // 2
     return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
 
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """One that has been filled."""
+    """A filled cache."""
     folder = tmp_path_factory.mktemp("cache")
     assert "compiled anew" not in find_with(folder)
     return folder
@@ -282,7 +282,7 @@ def test_hashed_tables_are_refused_on_an_accelerator() -> None:
 
 
 class Waits(TorchFunctionMode):
-    """Counts what hands numbers of a tensor to Python, for which an accelerator has to be waited for."""
+    """Counts transfers of tensor values to Python, each of which synchronises with the device."""
 
     NAMES = ("cpu", "item", "tolist", "numpy", "nonzero", "__bool__", "__int__", "__float__", "__index__", "equal")
 
@@ -292,7 +292,7 @@ class Waits(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = getattr(func, "__name__", "")
-        # What has been fetched is in the host's memory, and costs nothing more.
+        # Fetched values are in host memory and need no further synchronisation.
         fetched = name == "numpy" and self.counts["cpu"] > self.counts["numpy"]
         if name in self.NAMES:
             self.counts[name] += 1
@@ -302,7 +302,7 @@ class Waits(TorchFunctionMode):
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=cuda)])
 @pytest.mark.parametrize("n_envs", [1, 5])
-def test_torch_operations_wait_once_a_step(device: str, n_envs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torch_operations_synchronise_once_per_step(device: str, n_envs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     model = learn(n_envs=n_envs, device=device, policy_kwargs={"compiled": False}, search="brute")
     counted: list[Counter[str]] = []
     learn_step = model.learner.step
@@ -316,7 +316,7 @@ def test_torch_operations_wait_once_a_step(device: str, n_envs: int, monkeypatch
     monkeypatch.setattr(model.learner, "step", counting)
     model.learn(60 * n_envs, log_interval=None)
     assert len(counted) == 60
-    # The environments need their actions. On the CPU, where it costs nothing, a look at the errors comes on top.
+    # The actions must be fetched. On the CPU the errors are also checked, which costs nothing there.
     allowed = 2 if device == "cpu" else 1
     assert {counts["cpu"] for counts in counted} == {1}
     assert max(counts["waits"] for counts in counted) <= allowed

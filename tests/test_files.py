@@ -1,4 +1,4 @@
-"""Files: whole or not there, where they were asked for, and never run where they are only to be read."""
+"""Files are written atomically to the requested place, and no code in them is run."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_name_can_be_as_long_as_the_file_system_takes(
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-# ------------------------------------------------------------------------- what killed processes leave
+# ----------------------------------------------------------------------- files of killed processes
 
 WRITE_AND_WAIT = """
 import sys, time
@@ -86,7 +86,7 @@ with replacing(sys.argv[1]) as file:
 
 @pytest.fixture
 def begin_writing() -> Iterator[Callable[[pathlib.Path], subprocess.Popen[str]]]:
-    """Starts a process that has half written a file; it finishes when its standard input is closed."""
+    """A function that starts a process with a partially written file; closing its standard input lets it finish."""
     writers = []
 
     def begin(path: pathlib.Path) -> subprocess.Popen[str]:
@@ -114,7 +114,7 @@ def names(folder: pathlib.Path) -> list[str]:
         ("x" * 251 + ".zip", "x" * 251 + ".zip"),
     ],
 )
-def test_what_a_killed_process_left_is_swept_by_the_next(
+def test_files_of_a_killed_process_are_removed_by_the_next(
     tmp_path: pathlib.Path, begin_writing: Callable[..., subprocess.Popen[str]], left: str, saved: str
 ) -> None:
     writer = begin_writing(tmp_path / left)
@@ -126,7 +126,7 @@ def test_what_a_killed_process_left_is_swept_by_the_next(
 
 
 @pytest.mark.parametrize("left", ["other.zip", "run_2_100_steps.zip", "run_best.zip"])
-def test_what_was_to_be_another_file_is_left(
+def test_temporary_files_of_other_files_are_kept(
     tmp_path: pathlib.Path, begin_writing: Callable[..., subprocess.Popen[str]], left: str
 ) -> None:
     writer = begin_writing(tmp_path / left)
@@ -136,7 +136,7 @@ def test_what_was_to_be_another_file_is_left(
     assert len(names(tmp_path)) == 2
 
 
-def test_what_a_living_process_writes_is_nobodys_to_sweep(
+def test_temporary_files_of_running_processes_are_kept(
     tmp_path: pathlib.Path, begin_writing: Callable[..., subprocess.Popen[str]]
 ) -> None:
     writer = begin_writing(tmp_path / "model.zip")
@@ -149,7 +149,7 @@ def test_what_a_living_process_writes_is_nobodys_to_sweep(
 
 
 @pytest.mark.parametrize("other", ["run", "run_2"])
-def test_a_callback_leaves_what_another_is_writing(
+def test_a_callback_keeps_files_that_another_is_writing(
     make_model: MakeModel, tmp_path: pathlib.Path, begin_writing: Callable[..., subprocess.Popen[str]], other: str
 ) -> None:
     writer = begin_writing(tmp_path / f"{other}_40_steps.zip")
@@ -160,7 +160,7 @@ def test_a_callback_leaves_what_another_is_writing(
     assert f"{other}_40_steps.zip" in names(tmp_path)
 
 
-def test_killed_checkpoints_do_not_pile_up(
+def test_unfinished_checkpoints_do_not_accumulate(
     make_model: MakeModel, tmp_path: pathlib.Path, begin_writing: Callable[..., subprocess.Popen[str]]
 ) -> None:
     for name in ("run_13_steps.zip", "run_best.zip"):
@@ -214,7 +214,7 @@ def test_a_full_disk_leaves_nothing_half_written(make_model: MakeModel, small_di
 
 
 class Attack:
-    """Leaves a file when it is unpickled."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, mark: pathlib.Path) -> None:
         self.mark = mark
@@ -224,7 +224,7 @@ class Attack:
 
 
 def rewrite(path: pathlib.Path, change: Callable[[str, bytes], bytes | None], compression: int = 0) -> None:
-    """Write the members of a zip anew; ``None`` leaves one out."""
+    """Replace members of a zip file; ``None`` removes one."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, "w", compression) as archive:
@@ -235,7 +235,7 @@ def rewrite(path: pathlib.Path, change: Callable[[str, bytes], bytes | None], co
 
 
 def plant(path: pathlib.Path, mark: pathlib.Path) -> None:
-    """Put code into everything of a file that SB3 would unpickle, and into the notes of a checkpoint."""
+    """Put code into all parts of a file that SB3 would unpickle, and into the metadata of a checkpoint."""
     import base64
 
     attack = pickle.dumps(Attack(mark))
@@ -252,7 +252,7 @@ def plant(path: pathlib.Path, mark: pathlib.Path) -> None:
     rewrite(path, change)
 
 
-# What a model can hold that JSON cannot, without functions of the user's.
+# Arguments of models that JSON cannot represent, without user functions.
 ORDINARY: dict[str, dict[str, Any]] = {
     "defaults": {},
     "schedules": {"learning_rate": LinearSchedule(0.8, 0.1, 1.0), "trace_decay": LinearSchedule(0.3, 0.9, 1.0)},
@@ -312,7 +312,7 @@ def test_without_trust_a_function_is_refused_and_named(make_model: MakeModel, tm
     assert callable(type(model).load(tmp_path / "model.zip").weights)
 
 
-def test_a_file_of_before_loads_with_trust_alone(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_an_old_file_needs_trust(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     model = make_model().learn(100)
     model.save(tmp_path / "model.zip")
 
@@ -344,7 +344,7 @@ def test_a_file_of_before_loads_with_trust_alone(make_model: MakeModel, tmp_path
     ],
     ids=str,
 )
-def test_what_is_no_object_is_refused(code: Any) -> None:
+def test_invalid_pickles_are_refused(code: Any) -> None:
     with pytest.raises(ValueError, match="no object can be made"):
         decode(code)
 
@@ -356,7 +356,7 @@ def test_learning_beside_a_planted_checkpoint_runs_nothing(make_model: MakeModel
     plant(tmp_path / "checkpoint_best.zip", mark)
     with pytest.raises(ValueError, match="is no checkpoint"):
         model.learn(100, callback=TableCheckpointCallback(tmp_path), reset_num_timesteps=False)
-    # As they were written before.
+    # In the previous file format.
     rewrite(tmp_path / "checkpoint_best.zip", lambda name, content: None if name == "checkpoint.json" else content)
     with zipfile.ZipFile(tmp_path / "checkpoint_best.zip", "a") as archive:
         archive.writestr(
@@ -367,7 +367,7 @@ def test_learning_beside_a_planted_checkpoint_runs_nothing(make_model: MakeModel
     assert not mark.exists()
 
 
-def test_checkpoints_of_before_go_on(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_old_checkpoints_can_be_continued(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     model = make_model()
     callback = TableCheckpointCallback(tmp_path)
     model.learn(200, callback=callback)
@@ -441,7 +441,7 @@ def test_reading_a_filter_runs_nothing(tmp_path: pathlib.Path) -> None:
 
 
 @pytest.mark.parametrize("inner", [False, True], ids=["zip", "zip of torch in the zip"])
-def test_a_small_file_that_unfolds_to_gigabytes_is_refused(
+def test_a_small_file_that_decompresses_to_gigabytes_is_refused(
     make_model: MakeModel, tmp_path: pathlib.Path, inner: bool
 ) -> None:
     path = tmp_path / "model.zip"
@@ -471,15 +471,15 @@ def test_a_file_that_was_compressed_is_read(make_model: MakeModel, tmp_path: pat
     type(model).load(tmp_path / "model.zip")
 
 
-# -------------------------------------------------------------------------------------------------- states made up
+# -------------------------------------------------------------------------------------------------- invalid states
 
 
 @pytest.mark.parametrize("kind", ["dense", "hashed", "adaptive", "torch"])
-def test_a_state_that_was_tampered_with_is_learned_from_or_refused(tmp_path: pathlib.Path, kind: str) -> None:
+def test_a_modified_state_is_loaded_or_refused(tmp_path: pathlib.Path, kind: str) -> None:
     fuzz = pathlib.Path(__file__).with_name("fuzz_states.py")
     command = [sys.executable, str(fuzz), kind, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    # It may crash: that is what it is for.
+    # A separate process, because it may crash.
     assert done.returncode == 0, done.stdout[-300:] + done.stderr[-3000:]
 
 
@@ -506,7 +506,7 @@ def test_what_is_wrong_with_a_state_is_named(
     rewrite(tmp_path / "model.zip", lambda name, old: content.getvalue() if name == "learner.pth" else old)
     with pytest.raises(ValueError, match=message):
         type(model).load(tmp_path / "model.zip")
-    # The state was refused before anything of it was taken.
+    # The state was refused before any part of it was loaded.
     model.learn(101, reset_num_timesteps=False)
 
 
@@ -521,7 +521,7 @@ def test_what_is_wrong_with_a_state_is_named(
         ("_last_obs", encode(np.zeros((1, 1), np.float32))),
     ],
 )
-def test_other_data_that_cannot_be_is_refused(
+def test_other_invalid_data_is_refused(
     make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, attribute: str, value: Any
 ) -> None:
     model = make_model().learn(101)
@@ -552,7 +552,7 @@ def test_other_data_that_cannot_be_is_refused(
         ("n_steps", "many"),
     ],
 )
-def test_a_state_of_a_filter_that_cannot_be_is_refused(name: str, value: Any) -> None:
+def test_an_invalid_filter_state_is_refused(name: str, value: Any) -> None:
     table = DeltaFilter(DriftEnv(), points=4, bounds=(DriftEnv.LOW, DriftEnv.HIGH)).table
     state = table.state_dict()
     state |= {"points": th.tensor([0]), "deltas": th.zeros((1, 3, 2)).double(), "visits": th.zeros((1, 3)).double()}

@@ -1,4 +1,4 @@
-"""The δs filter: equal to Algorithm 5, takes noise out, does no harm, and fits in among SB3's wrappers."""
+"""The δs filter: equals Algorithm 5, removes noise, does no harm, and works with SB3's wrappers."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ PAPER: dict[str, Any] = {"learning_rate": 0.5, "gain": None, "warmup": 0.0}
 
 
 class Noisy(DriftEnv):
-    """A drifting point seen through noise.
+    """A drifting point with noisy observations.
 
-    :param continuous: whether the force is a number in [-1, 1] in place of one of three
+    :param continuous: whether the force is a number in [-1, 1] instead of one of three
     """
 
     def __init__(self, offset: float = 0.0, noise: float = 0.02, continuous: bool = False, **episodes: Any) -> None:
@@ -56,7 +56,7 @@ class Noisy(DriftEnv):
 
 
 class Linear(gym.Env[np.ndarray, int]):
-    """A random walk seen through noise of variance 1 in two dimensions, of which the second walks five times as fast.
+    """A random walk in two dimensions, observed with noise of variance 1.
 
     :param steps: standard deviations of a step, shape (2,)
     """
@@ -81,8 +81,8 @@ class Linear(gym.Env[np.ndarray, int]):
 
 class Broken(Noisy):
     """
-    Returns a given number in an observation after so many steps: in that of the last of them, or of the reset that
-    follows. Episodes have five.
+    Returns a given value in an observation after a number of steps: in that of the last step, or in that of the next
+    reset. Episodes have five steps.
     """
 
     def __init__(self, at: int, in_reset: bool, value: float) -> None:
@@ -182,7 +182,7 @@ def test_the_environment_wrapper_equals_the_vec_wrapper() -> None:
     assert same(table_of(env), table_of(venv))
 
 
-def test_a_schedule_goes_over_its_steps() -> None:
+def test_a_schedule_runs_over_its_steps() -> None:
     arguments = {**PERCEPTION, **PAPER, "learning_rate": lambda progress: progress, "total_timesteps": 40}
     env = DeltaFilter(Noisy(lengths=(100,)), **arguments)
     model = PaperFilter(NearestPoints((7, 5), BOUNDS, 4), 3, 2)
@@ -215,7 +215,7 @@ def test_the_compiled_step_equals_numpy(name: str) -> None:
     seen = []
     for compiled in (True, False):
         venv = VecDeltaFilter(make_venv(3), compiled=compiled, **arguments)
-        venv.table.n_measured = 900  # few steps are left to measure adaptive bounds by
+        venv.table.n_measured = 900  # few steps are left to measure adaptive bounds
         observations = walk(venv, 400)[0]
         venv.training = False
         seen.append(observations + walk(venv, 20, seed=1)[0])
@@ -230,7 +230,7 @@ def test_weights_can_be_a_function() -> None:
     np.testing.assert_allclose(walk(own, 100)[0], walk(built_in, 100)[0], rtol=0, atol=1e-6)
 
 
-def test_without_numba_it_says_so_and_works(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_numba_it_warns_and_works(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = walk(VecDeltaFilter(make_venv(), **PERCEPTION), 50)[0]
     monkeypatch.setattr(jit, "AVAILABLE", False)
     with pytest.warns(UserWarning, match="numba cannot be used"):
@@ -255,7 +255,7 @@ def test_the_adapted_gain_is_that_of_a_kalman_filter(steps: tuple[float, float])
     np.testing.assert_allclose(np.mean(gains[10_000:], axis=0), predicted / (predicted + 1), rtol=0, atol=0.05)
 
 
-def test_an_episode_begins_with_the_doubt_of_one_observation() -> None:
+def test_an_episode_starts_with_the_error_of_one_observation() -> None:
     env = DeltaFilter(Linear((0.01, 0.01)), points=1, n_neighbors=1)
     env.reset()
     for _ in range(5000):
@@ -267,12 +267,12 @@ def test_an_episode_begins_with_the_doubt_of_one_observation() -> None:
     for step in range(2, 6):
         estimate, _, _, _, info = env.step(0)
         seen.append(info["raw_observation"])
-        # All but the mean of so many observations, as long as the state has hardly moved.
+        # Nearly the mean of all observations, as long as the state has hardly changed.
         np.testing.assert_allclose(estimate, np.mean(seen, axis=0), rtol=0, atol=0.25)
         assert len(seen) == step
 
 
-def test_innovations_of_two_episodes_are_not_taken_for_successive() -> None:
+def test_innovations_of_different_episodes_are_not_correlated() -> None:
     venv = VecDeltaFilter(make_venv(2, lengths=(1,)), **PERCEPTION)
     walk(venv, 300)
     assert venv.table.counts[0] > 100
@@ -281,18 +281,18 @@ def test_innovations_of_two_episodes_are_not_taken_for_successive() -> None:
 
 @pytest.fixture
 def noise(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The benchmark, which is run from the root of the repository and not installed."""
+    """The benchmark module; benchmarks run from the repository root and are not installed."""
     monkeypatch.syspath_prepend(str(ROOT))
     return importlib.import_module("benchmarks.noise")
 
 
-def test_it_takes_noise_out_soon(noise: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_removes_noise_early(noise: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(noise, "EVALUATION", 5_000)
     assert (noise.error_ratio("filter", noise.CASES[0], seed=0, learning=15_000) < 0.45).all()
 
 
 @pytest.mark.slow
-def test_it_takes_more_than_half_of_the_noise_out(noise: Any) -> None:
+def test_it_removes_more_than_half_of_the_noise(noise: Any) -> None:
     for case in noise.CASES:
         ratios = np.median([noise.error_ratio("filter", case, seed) for seed in range(10)], axis=0)
         assert (ratios <= 0.45).all(), (case.env_id, ratios)
@@ -313,7 +313,7 @@ def test_without_noise_observations_pass(n_envs: int) -> None:
     assert np.max(off) < 0.01
 
 
-def test_many_environments_at_once_learn_as_stably_as_one(noise: Any) -> None:
+def test_many_environments_learn_as_stably_as_one(noise: Any) -> None:
     case = noise.CASES[0]
     venv = VecDeltaFilter(noise.make_noisy(case, 16, 0, True))
     venv.reset()
@@ -342,7 +342,7 @@ def test_frozen_it_filters_and_does_not_learn() -> None:
     assert not same(before, table_of(venv))
 
 
-def test_frozen_algorithm_5_still_follows_what_is_observed() -> None:
+def test_frozen_algorithm_5_still_follows_observations() -> None:
     venv = VecDeltaFilter(make_venv(lengths=(100_000,)), **PERCEPTION, **PAPER)
     walk(venv, 500)
     venv.training = False
@@ -354,7 +354,7 @@ def test_frozen_algorithm_5_still_follows_what_is_observed() -> None:
     assert np.mean(errors[200:]) < 0.1
 
 
-def test_an_untrusted_prediction_lets_the_observation_pass() -> None:
+def test_before_warmup_observations_pass_unchanged() -> None:
     venv = VecDeltaFilter(make_venv(), warmup=1e9, **PERCEPTION)
     observations, _, _, infos = walk(venv, 50)
     for seen, info in zip(observations[1:], infos, strict=True):
@@ -362,7 +362,7 @@ def test_an_untrusted_prediction_lets_the_observation_pass() -> None:
     assert venv.table.visits.sum() == pytest.approx(50)
 
 
-def test_an_open_range_is_measured_first() -> None:
+def test_unbounded_ranges_are_measured_first() -> None:
     env = DeltaFilter(gym.make("CartPole-v1"))
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -385,7 +385,7 @@ def test_an_open_range_is_measured_first() -> None:
     assert env.table.visits.any()
 
 
-def test_adaptive_bounds_take_what_was_learned_with_them() -> None:
+def test_adaptive_bounds_keep_learned_values() -> None:
     env = DeltaFilter(Linear((0.1, 0.1)), bounds="adaptive", points=5, n_neighbors=4)
     env.table.n_measured = 999
     env.reset()
@@ -398,11 +398,11 @@ def test_adaptive_bounds_take_what_was_learned_with_them() -> None:
     assert table.perceiver.sees(np.array([[50.0, 0.0]]))
     assert th.equal(table.perceiver.bounds.low, low)
     np.testing.assert_allclose(table.visits, 3.0)
-    # In the second dimension nothing moved but by what the interpolation blurs.
+    # In the second dimension the values changed only by the interpolation.
     np.testing.assert_allclose(table.deltas[:, 0, 1].reshape(5, 5)[0, [0, 4]], [-1.0, 1.0], atol=0.5)
 
 
-def test_box_actions_stand_at_their_nearest_points() -> None:
+def test_box_actions_are_mapped_to_the_nearest_points() -> None:
     space = spaces.Box(np.float32([-1, 0]), np.float32([1, 10]))
     env = Noisy()
     env.action_space = space
@@ -467,7 +467,7 @@ def test_stacks_with_other_wrappers(name: str) -> None:
     assert np.concatenate(dones).any()
 
 
-def test_vec_normalize_outside_gets_what_is_filtered() -> None:
+def test_vec_normalize_outside_gets_filtered_observations() -> None:
     venv = VecNormalize(VecDeltaFilter(make_venv(2), **PERCEPTION))
     walk(venv, 200)
     raw = venv.venv.get_original_obs()
@@ -479,7 +479,7 @@ def test_vec_normalize_inside_works_and_warns() -> None:
     with pytest.warns(UserWarning, match=r"Better VecNormalize\(VecDeltaFilter\(venv\)\)"):
         venv = VecDeltaFilter(VecNormalize(make_venv(2)))
     walk(venv, 100)
-    # The space does not tell the range of what is normalised.
+    # The space does not give the range of normalised observations.
     assert venv.table.must_measure(2)
     walk(venv, 500)
     assert not venv.table.must_measure(2)
@@ -490,7 +490,7 @@ def test_vec_normalize_inside_works_and_warns() -> None:
     ("algorithm", "continuous"),
     [("KNNTD", False), ("DQN", False), ("PPO", False), ("ExA", True), ("SAC", True), ("PPO", True)],
 )
-def test_serves_every_algorithm(algorithm: str, continuous: bool) -> None:
+def test_works_with_every_algorithm(algorithm: str, continuous: bool) -> None:
     venv = VecDeltaFilter(make_venv(continuous=continuous), **PERCEPTION)
     makers: dict[str, Callable[[], Any]] = {
         "KNNTD": lambda: KNNTD(venv, points=5, seed=0),
@@ -506,7 +506,7 @@ def test_serves_every_algorithm(algorithm: str, continuous: bool) -> None:
     assert np.isfinite(callback.last_mean_reward)
 
 
-def test_gymnasium_can_make_it_again() -> None:
+def test_gymnasium_can_recreate_it() -> None:
     env = DeltaFilter(gym.make("MountainCar-v0"), points=6, gain=0.3)
     assert env.spec is not None
     again = gym.make(env.spec)
@@ -542,7 +542,7 @@ def test_a_filter_of_one_kind_loads_into_the_other(tmp_path: pathlib.Path) -> No
     assert same(table_of(DeltaFilter.load(tmp_path / "other", Noisy())), table_of(venv))
 
 
-def test_what_is_saved_goes_on_after_measuring(tmp_path: pathlib.Path) -> None:
+def test_a_saved_filter_does_not_measure_again(tmp_path: pathlib.Path) -> None:
     venv = VecDeltaFilter(make_vec_env("CartPole-v1", 4, seed=0), points=4)
     walk(venv, 400)
     venv.save(tmp_path / "filter")
@@ -606,8 +606,8 @@ def test_another_file_is_refused(tmp_path: pathlib.Path) -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize(("at", "in_reset"), [(0, True), (3, False), (5, False), (5, True)])
-def test_what_is_not_finite_is_refused_and_not_learned(at: int, in_reset: bool, value: float) -> None:
-    """In the first reset, in the middle and at the end of an episode, and in the reset that follows it."""
+def test_nonfinite_observations_are_refused_and_not_learned(at: int, in_reset: bool, value: float) -> None:
+    """In the first reset, in the middle and at the end of an episode, and in the next reset."""
     venv = VecDeltaFilter(DummyVecEnv([Noisy, lambda: Broken(at, in_reset, value)]), **PERCEPTION)
     env: Any = DeltaFilter(Broken(at, in_reset, value), **PERCEPTION)
     for filtered, row, step in ((venv, 1, partial(venv.step, np.array([1, 1]))), (env, 0, partial(env.step, 1))):
@@ -684,7 +684,7 @@ def test_bad_action_points_are_named() -> None:
         (spaces.Box(0, 9, (2,), np.int64), "DtypeObservation"),
     ],
 )
-def test_observations_that_are_no_box_of_numbers(space: spaces.Space[Any], advice: str) -> None:
+def test_unsupported_observation_spaces(space: spaces.Space[Any], advice: str) -> None:
     env = Noisy()
     env.observation_space = space
     for make in (lambda: DeltaFilter(env), lambda: VecDeltaFilter(DummyVecEnv([lambda: env]))):
@@ -700,7 +700,7 @@ def test_observations_that_are_no_box_of_numbers(space: spaces.Space[Any], advic
         (spaces.Box(-np.inf, np.inf, (1,)), "finite bounds"),
     ],
 )
-def test_actions_that_have_no_columns(space: spaces.Space[Any], message: str) -> None:
+def test_unsupported_action_spaces(space: spaces.Space[Any], message: str) -> None:
     env = Noisy()
     env.action_space = space
     with pytest.raises(ValueError, match=message):

@@ -1,4 +1,4 @@
-"""The generalised Mountain-Car: what a problem is made of, what each part does to it, and that it is a good citizen."""
+"""The generalised Mountain-Car: its problems, the effect of each part, and compliance with gymnasium."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def test_problems_fill_their_ranges() -> None:
     assert np.abs(correlations).max() < 0.2
 
 
-def test_a_problem_stays_what_it_is() -> None:
-    # Results are reported by a problem's number: another draw would make them those of something else.
+def test_numbered_problems_never_change() -> None:
+    # Results are reported by problem number, so the problem of a number must never change.
     problem = numbered_problem(0)
     assert problem.offset == pytest.approx((0.8858751057657588, -0.3673256952290038))
     assert problem.noise_divider == pytest.approx((15.83513882974738, 6.884046281490399))
@@ -95,7 +95,7 @@ def test_a_number_is_the_same_problem_everywhere() -> None:
     assert make(problem=8).parameters != expected
 
 
-def test_a_problem_is_not_made_of_the_starts_numbers() -> None:
+def test_problems_and_starts_use_different_random_numbers() -> None:
     env = make(problem=3)
     env.reset(seed=3)
     drawn_from_the_seed = draw_problem(np.random.Generator(np.random.PCG64(np.random.SeedSequence(3))))
@@ -119,10 +119,10 @@ def test_without_a_number_the_seed_draws_the_problem() -> None:
     assert make(problem=None).parameters != make(problem=None).parameters
 
 
-# --- what is reported -------------------------------------------------------------------------------------------------
+# --- observations -----------------------------------------------------------------------------------------------------
 
 
-def test_the_reported_space_is_the_competitions() -> None:
+def test_the_observation_space_is_that_of_the_competition() -> None:
     for number in (0, 1, None):
         space = gym.make(NAME, problem=number).observation_space
         np.testing.assert_allclose(space.low, (-2.38, -1.084), rtol=1e-6)
@@ -131,7 +131,7 @@ def test_the_reported_space_is_the_competitions() -> None:
 
 @given(number=problems, seed=st.integers(0, 2**31), left=st.booleans())
 @settings(max_examples=40, deadline=None)
-def test_what_is_reported_is_within_what_the_problem_allows(number: int, seed: int, left: bool) -> None:
+def test_observations_are_within_the_limits_of_the_problem(number: int, seed: int, left: bool) -> None:
     env = GeneralizedMountainCarEnv(problem=number)
     offset, divider, _ = env.parameters
     observation, info = env.reset(seed=seed)
@@ -142,7 +142,7 @@ def test_what_is_reported_is_within_what_the_problem_allows(number: int, seed: i
         assert (np.abs(info["state"] - (-0.3, 0.0)) <= (0.9, 0.07)).all()
         expected = np.clip(info["state"] + offset, env.observation_space.low, env.observation_space.high)
         assert (np.abs(observation - expected) <= 0.5 * WIDTHS / divider + 1e-6).all()
-        # Rocking, so that both ends of the valley come up.
+        # Swinging, to reach both ends of the valley.
         push_left = left if step == 0 else info["state"][1] < 0
         observation, *_, info = env.step(0 if push_left else 2)
 
@@ -161,25 +161,25 @@ def test_noise_is_a_beta_distribution_of_the_problems_width() -> None:
     assert abs(np.corrcoef(betas.T)[0, 1]) < 0.1
 
 
-def test_offsets_displace_what_is_reported() -> None:
+def test_offsets_shift_the_observations() -> None:
     env = make(problem=2, noise=False)
     observations, states = roll(env, 0)
     np.testing.assert_allclose(observations, states + env.parameters.offset, rtol=1e-6, atol=1e-7)
 
 
-def test_velocities_beyond_the_competitions_limit_are_reported_at_it() -> None:
+def test_velocities_are_clipped_to_the_competitions_limit() -> None:
     number = next(number for number in range(1000) if numbered_problem(number).offset[1] > 0.98)
     observations, states = roll(make(problem=number, noise=False), 0)
     assert (states[:, 1] + numbered_problem(number).offset[1]).max() > 0.944
     assert observations[:, 1].max() == np.float32(0.944)
 
 
-# --- what moves -------------------------------------------------------------------------------------------------------
+# --- dynamics ---------------------------------------------------------------------------------------------------------
 
 
 @given(number=problems, seed=st.integers(0, 2**31), actions=st.lists(st.integers(0, 2), min_size=1, max_size=80))
 @settings(max_examples=25, deadline=None)
-def test_with_every_part_off_it_is_the_mountain_car(number: int, seed: int, actions: list[int]) -> None:
+def test_without_all_parts_it_is_the_mountain_car(number: int, seed: int, actions: list[int]) -> None:
     ours, plain = GeneralizedMountainCarEnv(problem=number, **ALL_OFF), sb3_knntd.envs.MountainCarEnv()
     np.testing.assert_array_equal(ours.reset(seed=seed)[0], plain.reset(seed=seed)[0])
     for action in actions:
@@ -207,7 +207,7 @@ def test_the_engine_varies_around_the_problems_strength() -> None:
     assert env.state == mountain_car_step((-0.5, 0.0), 1), "gravity does not vary"
 
 
-def test_the_force_is_a_number_numba_takes() -> None:
+def test_the_step_compiles_with_a_force() -> None:
     compiled = numba.njit(mountain_car_step)
     for force in (0.0008, 0.0012):
         assert compiled((-0.7, 0.01), 2, force) == mountain_car_step((-0.7, 0.01), 2, force)
@@ -224,7 +224,7 @@ def test_starts_fill_their_range() -> None:
 
 
 @pytest.mark.parametrize("switch", SWITCHES)
-def test_a_part_switched_off_leaves_the_others_as_they_are(switch: str) -> None:
+def test_disabling_a_part_does_not_change_the_others(switch: str) -> None:
     full, part = make(problem=1), make(problem=1, **{switch: False})
     (observations, states), (others, other_states) = roll(full, 3), roll(part, 3)
     assert (observations != others).any()
@@ -251,7 +251,7 @@ def test_only_the_true_position_ends_an_episode() -> None:
     assert not env.step(2)[2]
 
 
-# --- good citizens ----------------------------------------------------------------------------------------------------
+# --- gymnasium API ----------------------------------------------------------------------------------------------------
 
 VARIANTS: list[dict[str, Any]] = [
     {},
@@ -290,7 +290,7 @@ def test_the_same_seed_makes_the_same_episode(kwargs: dict[str, Any]) -> None:
         assert (roll(env, 9)[0] != first[0]).any()
 
 
-def test_info_tells_the_true_state() -> None:
+def test_info_contains_the_true_state() -> None:
     env = make()
     _, info = env.reset(seed=0)
     for action in (0, 1, 2):
@@ -323,7 +323,7 @@ def test_options_of_reset() -> None:
         env.reset(options={"low": -0.8, "high": -0.7})
         assert -0.8 <= env.state[0] <= -0.7
         assert env.state[1] == 0.0
-    # A state is a true one, wherever the offset puts it.
+    # The state is the true one, independent of the offset.
     with pytest.raises(ValueError, match=re.escape("2 numbers from (-1.2, -0.07) to (0.6, 0.07); got (1.5, 0.0)")):
         env.reset(options={"state": (1.5, 0.0)})
 
@@ -350,7 +350,7 @@ def test_bad_actions(action: Any) -> None:
     assert env.state == (-0.5, 0.0)
 
 
-def test_step_wants_a_reset_first() -> None:
+def test_step_needs_a_reset_first() -> None:
     with pytest.raises(ResetNeeded, match=r"reset\(\) before step"):
         make().step(0)
 

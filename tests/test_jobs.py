@@ -1,4 +1,4 @@
-"""Jobs: each computed once, whatever becomes of the others, of their processes and of the program."""
+"""Jobs: each is computed once, even if other jobs, their processes or the program fail."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
 
 
 def is_running(pid: int) -> bool:
-    """Whether there is such a process; one that has ended and whose parent has not asked for it counts as none."""
+    """Whether a process is running; zombies do not count."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
@@ -81,12 +81,12 @@ def test_each_is_computed_once_for_its_arguments(tmp_path: Path, capfd: pytest.C
         "arguments": {"number": 3, "log": str(log)},
         "result": {"square": 9, "pair": [3, 3]},
     }
-    # Not on a terminal: lines, with how many there are and how long it may take.
+    # Not on a terminal: lines with the number of jobs and the remaining time.
     lines = capfd.readouterr().err.splitlines()
     assert [line.split(",")[0] for line in lines] == [f"squares: {n} of 3" for n in (1, 2, 3)]
     assert all(line.endswith("left") for line in lines)
 
-    # One with other arguments, one damaged, one of another function, one that has failed: all to be computed again.
+    # Other arguments, a damaged file, another function, a failed job: all must be computed again.
     jobs = squares([3, 1, 2, 4], log)
     jobs[0] = jobs[0]._replace(arguments={"number": 5, "log": str(log)})
     (folder / "square-1.json").write_bytes((folder / "square-1.json").read_bytes()[:-9])
@@ -103,7 +103,7 @@ def test_each_is_computed_once_for_its_arguments(tmp_path: Path, capfd: pytest.C
     assert sorted(path.name for path in folder.glob("*.json")) == [f"square-{n}.json" for n in (1, 2, 3, 4)]
 
 
-def test_what_fails_or_dies_does_not_sink_the_rest(
+def test_failing_and_dying_jobs_do_not_affect_the_others(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
@@ -140,18 +140,18 @@ def test_what_fails_or_dies_does_not_sink_the_rest(
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
 @pytest.mark.parametrize("blow", [signal.SIGINT, signal.SIGKILL])
-def test_interrupted_it_keeps_what_is_finished_and_goes_on(tmp_path: Path, blow: signal.Signals) -> None:
+def test_interrupted_jobs_keep_results_and_continue(tmp_path: Path, blow: signal.Signals) -> None:
     folder, pids, script = tmp_path / "jobs", tmp_path / "pids", tmp_path / "script.py"
     pids.mkdir()
     script.write_text(INTERRUPTIBLE)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     command = [sys.executable, str(script), str(folder), str(pids)]
     program = subprocess.Popen([*command, "60"], env=environment, start_new_session=True)
-    # The one process begins the slow job when the quick one's outcome is on the disk or about to be.
+    # The single worker starts the slow job when the result of the fast one is, or is about to be, on disk.
     wait_until(lambda: (folder / "quick.json").exists())
     time.sleep(0.2)
     if blow == signal.SIGINT:
-        os.killpg(program.pid, blow)  # as a terminal does
+        os.killpg(program.pid, blow)  # like a terminal
     else:
         os.kill(program.pid, blow)
     assert program.wait(20) == (130 if blow == signal.SIGINT else -blow)
@@ -168,7 +168,7 @@ def test_interrupted_it_keeps_what_is_finished_and_goes_on(tmp_path: Path, blow:
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="cannot start a process that has signals blocked")
 def test_ctrl_c_waits_until_a_process_is_started() -> None:
-    """Any thread may receive it, and its process would come to the world half told what to do."""
+    """Otherwise any thread may receive the signal, and a process could be started with incomplete data."""
     program = "import signal; print(signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
     blocked = []
 
@@ -202,7 +202,7 @@ def test_a_key_must_be_a_file_name(key: str, tmp_path: Path) -> None:
     assert not (tmp_path / "jobs").exists()
 
 
-def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
+def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
     job = Job("a", job_functions.unstorable, {})
     with pytest.raises(ValueError, match="keys must differ"):
         run_jobs([job, job], tmp_path)
@@ -242,14 +242,14 @@ def test_a_second_process_in_the_folder_says_so_and_computes_nothing(tmp_path: P
     finally:
         program.kill()
         program.wait()
-    # The lock of a killed process is gone.
+    # The lock of a killed process is released.
     assert run_jobs(squares([3], tmp_path / "log"), folder, workers=1)["square-3"].result["square"] == 9
 
 
 @pytest.mark.parametrize(
     "content", [b"[]", b"{", b'{"result": 3}', b"[" * 100_000], ids=["list", "cut", "alone", "deep"]
 )
-def test_a_damaged_file_is_named_and_its_job_computed_anew(
+def test_a_damaged_file_is_named_and_its_job_repeated(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], content: bytes
 ) -> None:
     jobs = squares([3], tmp_path / "log")
@@ -262,9 +262,7 @@ def test_a_damaged_file_is_named_and_its_job_computed_anew(
     assert (f"{path} is damaged" in told) == (content != b'{"result": 3}'), "of another job is not damaged"
 
 
-def test_a_result_that_does_not_fit_is_named_and_computed_anew(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_invalid_result_is_named_and_its_job_repeated(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     jobs = [job._replace(fits=lambda result: "square" in result) for job in squares([3], tmp_path / "log")]
     folder = tmp_path / "jobs"
     run_jobs([job._replace(fits=None) for job in jobs], folder, workers=1)
@@ -290,10 +288,8 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize(("times", "said"), [(1, "alive"), (9, "its process died 2 times: killed, or short of memory")])
-def test_a_worker_that_dies_in_the_middle_of_a_large_answer_holds_nothing_up(
-    tmp_path: Path, times: int, said: str
-) -> None:
-    # As workers did at Ctrl-C: whoever waited for the other half waited for ever.
+def test_a_worker_that_dies_while_sending_a_large_result_does_not_block(tmp_path: Path, times: int, said: str) -> None:
+    # As workers did at Ctrl-C: the reader of the other half would wait forever.
     script = tmp_path / "script.py"
     script.write_text(DYING)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}

@@ -1,4 +1,4 @@
-"""The package's callbacks: they show what is so, keep what is whole, and change nothing that is learned."""
+"""The package's callbacks: correct output, complete files, and no effect on learning."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ MakeVenv = Callable[..., VecEnv]
 
 
 class ContinuousDrift(DriftEnv):
-    """The drifting point, pushed by a force, or by several that add up."""
+    """The drifting point, pushed by the sum of one or more forces."""
 
     def __init__(self, action_dim: int = 1, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -88,7 +88,7 @@ def test_every_callback_is_exported() -> None:
         assert issubclass(getattr(package, name), BaseCallback)
 
 
-# ------------------------------------------------------------------ all of them
+# --------------------------------------------------------------- all callbacks
 
 ALGORITHMS: dict[str, Callable[..., KNNAlgorithm]] = {
     "KNNTD": lambda env: KNNTD(env, points=(8, 6), bounds=(DriftEnv.LOW, DriftEnv.HIGH), seed=0),
@@ -105,7 +105,7 @@ ALGORITHMS: dict[str, Callable[..., KNNAlgorithm]] = {
 
 
 class Rendered(gym.Wrapper):  # type: ignore[type-arg]
-    """Shows a picture of noise that changes with every step."""
+    """Renders noise that changes with every step."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -211,11 +211,11 @@ def test_arguments_that_do_not_fit(make: Callable[[], BaseCallback], message: st
         make()
 
 
-# ----------------------------------------------------------------------- pacing
+# ------------------------------------------------------------------- throttling
 
 
 class Ticking(PerceptionStatsCallback):
-    """Acts for a number of seconds of a clock that every step moves on."""
+    """Acts for a given time of a simulated clock that every step advances."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, act_seconds: float, step_seconds: float) -> None:
         super().__init__()
@@ -230,10 +230,11 @@ class Ticking(PerceptionStatsCallback):
         self.acts.append(self.n_calls)
 
 
-def test_by_default_it_takes_its_share_of_the_time(make_model: MakeModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_by_default_it_uses_its_share_of_the_time(make_model: MakeModel, monkeypatch: pytest.MonkeyPatch) -> None:
     callback = Ticking(monkeypatch, act_seconds=0.2, step_seconds=0.1)
     make_model().learn(4500, callback=callback)
-    # Two thousandths: the first is taken to last 5 ms, which 2.5 s pay for; but it lasts 0.2 s, and 100 s pay for that.
+    # A share of 0.2 %: the first act is expected to last 5 ms, due after 2.5 s; it lasts 0.2 s, so the next is due
+    # after 100 s.
     first, *others = callback.acts
     assert 25 <= first <= 25 + 128
     np.testing.assert_allclose(others, [2000, 3000, 4000, 4500], atol=128)
@@ -244,7 +245,7 @@ def test_nothing_is_done_twice_at_the_end(make_model: MakeModel, tmp_path: pathl
     model = make_model().learn(100, callback=callback)
     times = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert sorted(times) == ["value_map_100.png", "value_map_50.png"]
-    # No step, no picture.
+    # No plot without a step.
     model.learn(0, callback=callback, reset_num_timesteps=False)
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == times
 
@@ -266,18 +267,18 @@ def test_the_benchmark_measures_every_callback(monkeypatch: pytest.MonkeyPatch) 
 
 
 class Undrawn(ValueMapCallback):
-    """Counts when it should draw, which takes a thousandth of the time."""
+    """Records when it should draw, at 0.1 % of the time."""
 
     def _act(self) -> None:
         self._visitation.count(self._extent())
 
 
 @pytest.mark.parametrize(("n_envs", "n_steps"), [(1, 200), (1, 2500), (3, 1500)])
-def test_visits_and_routes_are_where_the_environments_were(
+def test_visits_and_trajectories_match_the_observations(
     make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, n_envs: int, n_steps: int
 ) -> None:
     venv = RecordingVecEnv(make_venv(n_envs))
-    # Narrower than where it goes: what is outside is not in the picture.
+    # Narrower than the visited range: visits outside are not shown.
     low, high = np.array([-0.8, -0.02]), np.array([0.2, 0.03])
     callback = Undrawn(folder=tmp_path, resolution=7, n_routes=2)
     make_model(venv, bounds=(low, high)).learn(n_steps, callback=callback)
@@ -300,7 +301,7 @@ def test_visits_and_routes_are_where_the_environments_were(
         np.testing.assert_array_equal(drawn, was)
 
 
-def test_visits_go_on_in_another_learn(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_visits_continue_in_another_learn(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     callback = Undrawn(folder=tmp_path, resolution=3)
     model = make_model(bounds=([-50.0, -50.0], [50.0, 50.0]))
     model.learn(70, callback=callback)
@@ -320,7 +321,7 @@ def test_a_long_episode_is_drawn_from_its_last_part(make_model: MakeModel, tmp_p
     assert BUFFERED * (MAX_CHUNKS - 1) <= len(route) <= BUFFERED * (MAX_CHUNKS + 1) + 1
 
 
-def test_visits_move_over_when_the_range_changes(tmp_path: pathlib.Path) -> None:
+def test_visits_are_kept_when_the_range_changes(tmp_path: pathlib.Path) -> None:
     model = KNNTD("CartPole-v1", points=3, n_neighbors=4, seed=0)
     callback = Undrawn(dims=(1, 3), draw_freq=900, folder=tmp_path, resolution=10)
     model.learn(2048, callback=callback)
@@ -384,7 +385,7 @@ def test_files_and_tensorboard_hold_the_same_picture(make_model: MakeModel, tmp_
         assert len(set(logged.getdata())) > 50
 
 
-def test_without_a_place_to_go_the_map_says_so(make_model: MakeModel) -> None:
+def test_a_map_without_output_is_an_error(make_model: MakeModel) -> None:
     model = make_model()
     with pytest.raises(ValueError, match=r"nowhere to go\. Give the model tensorboard_log, or the callback folder"):
         model.learn(100, callback=ValueMapCallback())
@@ -400,7 +401,7 @@ def test_without_a_place_to_go_the_map_says_so(make_model: MakeModel) -> None:
         (DriftEnv(), {"names": (("one",), ("other",))}, "names must hold one for each"),
     ],
 )
-def test_a_view_that_does_not_fit_is_refused_at_once(
+def test_an_invalid_view_is_refused_at_once(
     tmp_path: pathlib.Path, env: Any, arguments: dict[str, Any], message: str
 ) -> None:
     from sb3_knntd.plots import Names
@@ -414,7 +415,7 @@ def test_a_view_that_does_not_fit_is_refused_at_once(
 
 
 class SeveralDims(DriftEnv):
-    """The drifting point, with two dimensions more that stand still."""
+    """The drifting point with two additional constant dimensions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -424,10 +425,10 @@ class SeveralDims(DriftEnv):
         return np.concatenate([super()._observe(), [0.25, -0.5]]).astype(np.float32)
 
 
-def test_averages_are_over_the_places_where_something_was_learned() -> None:
+def test_averages_are_over_visited_points() -> None:
     model = KNNTD(SeveralDims(), points=5, n_neighbors=1, seed=0)
     points = model.policy.points
-    # Worth something on one side of dimension 2 only.
+    # Nonzero values on one side of dimension 2 only.
     values = th.where(points[:, 2:3] > 0.1, 2.0 + points[:, :1], 0.0) + th.where(
         points[:, 2:3] > 0.1, th.tensor([0.0, 0.5, 0.0]), th.zeros(3)
     )
@@ -457,7 +458,7 @@ def test_the_value_of_continuous_actions_is_the_mean_of_the_best() -> None:
 
 
 def stats(model: KNNAlgorithm, folder: pathlib.Path, n_steps: int = 400, **arguments: Any) -> list[dict[str, float]]:
-    """What is logged, one dict a log."""
+    """The logged values, one dict per log."""
     model.set_logger(configure(str(folder), ["tensorboard"]))
     callback = PerceptionStatsCallback(**{"log_freq": n_steps // 2 // model.n_envs, **arguments})
     model.learn(n_steps, callback=callback, log_interval=None)
@@ -498,8 +499,8 @@ def test_stats_of_a_table_that_is_not_learned(
 
 
 @pytest.mark.parametrize("target", ["sarsa", "q_learning", "expected_sarsa"])
-def test_td_errors_vanish_where_all_is_known(tmp_path: pathlib.Path, target: str) -> None:
-    # A state each, rewards that hang on nothing but the state, and no following state: Q is the reward.
+def test_td_errors_vanish_after_convergence(tmp_path: pathlib.Path, target: str) -> None:
+    # One state per episode with a reward that depends only on the state, and no next state: Q is the reward.
     env = GridEnv("discrete", lengths=[1], ends=["terminated"])
     model = KNNTD(env, learning_rate=1.0, target=target, exploration_initial_eps=0.5, seed=0)
     last = stats(model, tmp_path, 4000)[-1]
@@ -510,7 +511,7 @@ def test_td_errors_vanish_where_all_is_known(tmp_path: pathlib.Path, target: str
 
 def test_changes_of_the_policy_are_seen(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     class Turn(BaseCallback):
-        """Makes another action the best everywhere, once."""
+        """Makes another action the best one everywhere, once."""
 
         def _on_step(self) -> bool:
             if self.n_calls == 300:
@@ -536,7 +537,7 @@ def test_points_with_a_trace_are_counted_alike(
     counts = []
     for compiled in (True, False):
         model = make_model(trace_decay=trace_decay, policy_kwargs={"compiled": compiled})
-        # 403 steps end in the middle of an episode.
+        # 403 steps stop in the middle of an episode.
         last = stats(model, tmp_path / str(compiled), 403, log_freq=403)[-1]
         counts.append(last["train/trace_points"])
     if trace_decay:
@@ -546,7 +547,7 @@ def test_points_with_a_trace_are_counted_alike(
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_steps_that_measure_a_range_are_not_sampled(tmp_path: pathlib.Path, n_envs: int) -> None:
+def test_measuring_steps_are_not_sampled(tmp_path: pathlib.Path, n_envs: int) -> None:
     model = KNNTD(make_vec_env("CartPole-v1", n_envs), points=3, n_neighbors=4, seed=0)
     model.set_logger(configure(str(tmp_path), ["tensorboard"]))
     callback = PerceptionStatsCallback(log_freq=100)
@@ -560,7 +561,7 @@ def test_steps_that_measure_a_range_are_not_sampled(tmp_path: pathlib.Path, n_en
 def test_stats_of_normalised_environments(make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
     model = make_model(VecNormalize(make_venv(2)), bounds=([-2.0, -2.0], [2.0, 2.0]))
     last = stats(model, tmp_path, 4000)[-1]
-    # In the model's own units, of which few are beyond two deviations.
+    # In normalised units, in which few observations are beyond two standard deviations.
     assert last["perception/outside_share"] < 0.5
 
 
@@ -568,7 +569,7 @@ def test_stats_of_normalised_environments(make_model: MakeModel, make_venv: Make
 
 
 class Snapshot(BaseCallback):
-    """Copies the environments, without their wrappers, after so many calls, for a run that goes on from there."""
+    """Copies the environments, without their wrappers, after a number of calls, for a run that continues from there."""
 
     def __init__(self, at: int) -> None:
         super().__init__()
@@ -582,7 +583,7 @@ class Snapshot(BaseCallback):
 
 
 class Shift(VecEnvWrapper):
-    """Moves observations by the running mean of all there were: a filter with a state, saved like VecNormalize's."""
+    """Subtracts the running mean of the observations: a wrapper with a state, saved like VecNormalize."""
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
@@ -658,7 +659,7 @@ def test_resume_wraps_a_bare_environment(make_model: MakeModel, make_venv: MakeV
         assert resumed.num_timesteps == 150
 
 
-def test_resume_brings_back_what_a_filter_has_learned(make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
+def test_resume_restores_the_table_of_a_filter(make_venv: MakeVenv, tmp_path: pathlib.Path) -> None:
     model = KNNTD(VecDeltaFilter(make_venv(2)), points=5, n_neighbors=3, seed=0)
     model.learn(300, callback=TableCheckpointCallback(tmp_path))
     resumed = TableCheckpointCallback.resume(tmp_path, make_venv(2))
@@ -677,13 +678,13 @@ def test_resume_finds_the_algorithm(tmp_path: pathlib.Path, cls: type[KNNAlgorit
     assert type(resumed) is cls
     assert same_table(resumed, model)
     assert resumed.learn(100, reset_num_timesteps=False).num_timesteps == 400
-    # A checkpoint is a saved model, too.
+    # A checkpoint is also a saved model.
     assert same_table(cls.load(tmp_path / "checkpoint_300_steps"), model)
 
 
 def test_the_last_and_the_best_are_kept(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     class Returns(BaseCallback):
-        """Has every episode's return be what it says."""
+        """Sets the return of every episode."""
 
         def _on_step(self) -> bool:
             mean = {20: 1.0, 40: 5.0, 60: 2.0, 80: 5.0, 100: 4.0}.get(self.n_calls)
@@ -703,7 +704,7 @@ def test_the_last_and_the_best_are_kept(make_model: MakeModel, tmp_path: pathlib
     assert KNNTD.load(callback.best_path).num_timesteps == 40
     assert TableCheckpointCallback.resume(callback.best_path, DriftEnv()).num_timesteps == 40
 
-    # What was best before a crash is best after it.
+    # The best checkpoint before a crash is still the best after it.
     again = TableCheckpointCallback(tmp_path, save_freq=20)
     model = TableCheckpointCallback.resume(tmp_path, DriftEnv())  # type: ignore[assignment]
     model.learn(60, callback=again, reset_num_timesteps=False)
@@ -729,7 +730,7 @@ def test_checkpoints_of_another_run_are_not_overwritten(make_model: MakeModel, t
     assert TableCheckpointCallback.resume(tmp_path, DriftEnv()).num_timesteps == 60
 
 
-def test_where_there_is_no_checkpoint(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_resume_without_a_checkpoint(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no checkpoint checkpoint_\*_steps\.zip in"):
         TableCheckpointCallback.resume(tmp_path / "nowhere", DriftEnv())
     make_model().save(tmp_path / "model.zip")
@@ -744,15 +745,15 @@ def test_where_there_is_no_checkpoint(make_model: MakeModel, tmp_path: pathlib.P
 
 def in_child(work: Callable[[Event], Any], seconds: float | None = None) -> int | None:
     """
-    Run in a process of its own, which is killed so many seconds after it has set the event, if it does not kill itself;
-    its exit code. It is no fork of this one, whose libraries have threads.
+    Run in a separate process and return its exit code. The process is killed the given time after it has set the event,
+    unless it kills itself. It is not forked, because libraries in this process have threads.
     """
     context = multiprocessing.get_context("spawn")
     begun = context.Event()
     child = context.Process(target=carry_out, args=(CloudpickleWrapper(work), begun))
     child.start()
     if seconds is not None:
-        # Killed even if it never begins: nothing outlives a failed test.
+        # Kill the process in any case, so that it does not outlive a failed test.
         begun.wait(60)
         child.join(seconds)
         child.kill()
@@ -775,7 +776,7 @@ DEADLY = {
 
 @pytest.mark.parametrize("nth", [1, 4])
 @pytest.mark.parametrize("where", DEADLY)
-def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(
+def test_a_kill_at_any_time_leaves_a_complete_checkpoint(
     make_model: MakeModel, tmp_path: pathlib.Path, where: str, nth: int
 ) -> None:
     make_model().learn(40, callback=TableCheckpointCallback(tmp_path, n_last=2))
@@ -792,7 +793,7 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(
 
         setattr(owner, name, deadly)
         model = TableCheckpointCallback.resume(tmp_path, DriftEnv())
-        # Every checkpoint is the best so far, or nothing would be copied.
+        # Every checkpoint is the best so far; otherwise nothing would be copied.
         callback = TableCheckpointCallback(tmp_path, save_freq=10, n_last=2)
         model.learn(100, callback=[Rising(), callback], reset_num_timesteps=False)
 
@@ -802,19 +803,19 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(
     callback = TableCheckpointCallback(tmp_path, n_last=2)
     resumed.learn(100, callback=callback, reset_num_timesteps=False)
     assert KNNTD.load(callback.best_path).policy.q_table.any()
-    # What the kill left half written is gone.
+    # Partially written files are removed.
     assert len(list(tmp_path.iterdir())) == 3
 
 
 class Rising(BaseCallback):
-    """Has the mean return rise with every step."""
+    """Makes the mean return increase with every step."""
 
     def _on_step(self) -> bool:
         self.model.ep_info_buffer.append({"r": float(self.num_timesteps), "l": 1, "t": 0})  # type: ignore[union-attr]
         return True
 
 
-def test_kills_at_random_moments(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_kills_at_random_times(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     make_model().learn(20, callback=TableCheckpointCallback(tmp_path))
 
     def work(begun: Event) -> None:
@@ -850,7 +851,7 @@ def test_a_video_shows_an_episode_of_the_greedy_policy(make_model: MakeModel, tm
     model.learn(100, callback=EpisodeVideoCallback(env, folder=tmp_path, verbose=1))
     for step in env.steps:
         assert step.actions == model.predict(step.observations, deterministic=True)[0]
-    # The reset's and those of the nine steps.
+    # The frame of the reset and those of the nine steps.
     assert len(env.steps) == 9
     frames = frames_of(tmp_path / "episode_100.gif")
     assert len(frames) == 10
@@ -890,7 +891,7 @@ def test_videos_of_normalised_environments_use_the_statistics_of_training(
     np.testing.assert_array_equal(other.obs_rms.mean, train.obs_rms.mean)
 
 
-def test_without_a_place_to_go_the_video_says_so(make_model: MakeModel) -> None:
+def test_a_video_without_output_is_an_error(make_model: MakeModel) -> None:
     with pytest.raises(ValueError, match="the video has nowhere to go"):
         make_model().learn(100, callback=EpisodeVideoCallback(Rendered(DriftEnv())))
 
@@ -898,7 +899,7 @@ def test_without_a_place_to_go_the_video_says_so(make_model: MakeModel) -> None:
 # ---------------------------------------------------------------------- HParams
 
 
-def test_hparams_are_what_the_model_was_made_with(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_hparams_are_the_arguments_of_the_model(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     from tensorboard.plugins.hparams import plugin_data_pb2
 
     model = make_model(

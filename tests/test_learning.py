@@ -1,4 +1,4 @@
-"""It learns: a threshold far from chance and safely below what it does."""
+"""Training reaches thresholds far above random actions and safely below typical results."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_mountain_car_in_ten_thousand_steps(settings: dict[str, Any]) -> None:
         "MountainCar-v0", points=12, n_neighbors=4, gamma=1.0, exploration_initial_eps=0.0, seed=0, **settings
     )
     model.learn(10_000)
-    # Chance is at -200; other seeds end between -128 and -146.
+    # Random actions have a return of -200; other seeds end between -128 and -146.
     assert greedy_return(model, "MountainCar-v0", 10) >= -170.0
 
 
@@ -50,8 +50,8 @@ def test_mountain_car_with_many_environments() -> None:
     assert greedy_return(model, "MountainCar-v0", 10) >= -170.0
 
 
-def test_values_of_a_place_that_is_left_in_one_step() -> None:
-    # One step of reward 1 a game, with nothing after it: every value becomes 1, wherever it is asked for.
+def test_values_of_episodes_of_one_step() -> None:
+    # Episodes of one step with a reward of 1: every value becomes 1 everywhere.
     env = gym.wrappers.TransformReward(DriftEnv(lengths=[1], ends=["terminated"]), lambda _: 1.0)
     model = KNNTD(
         env, points=2, bounds=([-1.0, -0.05], [0.5, 0.06]), n_neighbors=4, learning_rate=0.5, seed=0,
@@ -67,5 +67,5 @@ def test_values_of_a_place_that_is_left_in_one_step() -> None:
     ("env_id", "threshold"), [("MountainCar-v0", -150.0), ("CartPole-v1", 300.0), ("Acrobot-v1", -150.0)]
 )
 def test_untuned(env_id: str, threshold: float) -> None:
-    # One seed, so the thresholds leave room below the medians that the benchmark prints.
+    # A single seed, so the thresholds are below the medians of the benchmark.
     assert greedy_return(KNNTD(env_id, seed=0).learn(50_000), env_id, 50) >= threshold

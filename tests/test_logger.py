@@ -1,4 +1,4 @@
-"""What is logged, under which names, when and where."""
+"""The logged values, their keys, and when and where they are logged."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OWN_KEYS = {
     "train/visited_points",
     "train/q_mean",
 }
-# SB3 keeps these out of TensorBoard.
+# SB3 excludes these from TensorBoard.
 TEXT_KEYS = {"time/episodes", "time/time_elapsed", "time/total_timesteps"}
 
 
@@ -61,7 +61,7 @@ def test_values(make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
     model = make_model(
         learning_rate=LinearSchedule(0.8, 0.2, 1.0), exploration_initial_eps=0.6, exploration_fraction=0.5
     )
-    # Episodes of 9, 14 and 6 steps: the fifth is over after 9 + 14 + 6 + 9 + 14.
+    # Episodes of 9, 14 and 6 steps: the fifth ends after 9 + 14 + 6 + 9 + 14 steps.
     logged(model, tmp_path).learn(100, log_interval=5)
     first = read_log(tmp_path)[0]
     assert first["time/total_timesteps"] == 52
@@ -87,10 +87,8 @@ def test_exploration_rate_follows_its_schedule(
         assert row["train/exploration_rate"] == pytest.approx(max(0.2, 0.6 - 0.4 * progress / 0.5))
 
 
-def test_visited_points_are_those_that_were_learned_at(
-    make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
-) -> None:
-    # With a value that no state has, every entry learned at has moved away from it.
+def test_visited_points_are_the_updated_ones(make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path) -> None:
+    # With an unattainable initial value every updated entry differs from it.
     model = make_model(initial_value=-77.0, exploration_initial_eps=1.0, trace_decay=0.0)
     logged(model, tmp_path).learn(52, log_interval=5)
     moved = int((model.policy.q_table != -77.0).any(dim=1).sum())
@@ -99,7 +97,7 @@ def test_visited_points_are_those_that_were_learned_at(
 
 
 class SameEpisode(gym.Wrapper[Any, Any, Any, Any]):
-    """Every episode is the first."""
+    """Every episode is equal to the first."""
 
     def reset(self, **kwargs: Any) -> Any:
         self.unwrapped.episode = -1  # type: ignore[attr-defined]
@@ -109,7 +107,7 @@ class SameEpisode(gym.Wrapper[Any, Any, Any, Any]):
 def test_means_are_of_the_steps_since_the_last_log(
     env_cls: type[DriftEnv], make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
 ) -> None:
-    # A table that does not move has the same TD errors in the same episode, whatever came before it.
+    # A constant table has the same TD errors in every equal episode.
     model = make_model(
         SameEpisode(env_cls()), learning_rate=0.0, initial_value=-3.0, tie_break="first", exploration_initial_eps=0
     )
@@ -142,7 +140,7 @@ def test_means_are_over_the_window(make_model: MakeModel, read_log: ReadLog, tmp
     assert [row["rollout/ep_len_mean"] for row in read_log(tmp_path)][:4] == [9.0, 11.5, 10.0, 7.5]
 
 
-def test_environments_without_monitor_log_what_is_known(
+def test_environments_without_monitor_log_no_episodes(
     env_cls: type[DriftEnv], make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path
 ) -> None:
     logged(make_model(DummyVecEnv([env_cls])), tmp_path).learn(60)
@@ -159,7 +157,7 @@ def test_vec_monitor_is_read(
 
 
 class WithSuccess(gym.Wrapper[Any, Any, Any, Any]):
-    """Every step says that it was a success."""
+    """Every step reports a success."""
 
     def step(self, action: Any) -> Any:
         observation, reward, terminated, truncated, info = super().step(action)
@@ -173,7 +171,7 @@ def test_success_rate(
     assert read_log(tmp_path)[-1]["rollout/success_rate"] == 1.0
 
 
-def test_learning_on_goes_on_counting(make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path) -> None:
+def test_continued_learning_keeps_counting(make_model: MakeModel, read_log: ReadLog, tmp_path: pathlib.Path) -> None:
     model = logged(make_model(), tmp_path).learn(40, log_interval=1)
     model.learn(40, log_interval=1, reset_num_timesteps=False)
     rows = read_log(tmp_path)
@@ -203,7 +201,7 @@ def test_verbose_prints_the_table(
 
 
 def read_tensorboard(folder: pathlib.Path) -> dict[str, list[int]]:
-    """The steps of every scalar in a run's folder."""
+    """The steps of every scalar in the folder of a run."""
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     events = accumulator.EventAccumulator(str(folder))
     events.Reload()
@@ -232,7 +230,7 @@ def test_runs_are_numbered_by_name(algorithm: Algorithm, make_model: MakeModel, 
     ]
 
 
-def test_learning_on_writes_into_the_same_run(
+def test_continued_learning_logs_to_the_same_run(
     algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path
 ) -> None:
     model = make_model(tensorboard_log=str(tmp_path)).learn(40)

@@ -1,4 +1,4 @@
-"""The package as it is installed: its names, its files, its documentation."""
+"""The installed package: names, files and docstrings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pytest
 import sb3_knntd
 
 ROOT = pathlib.Path(__file__).parent.parent
-# The folders of the root that are installed under another name.
+# Folders of the root that are installed as subpackages.
 MAPPED = {"callbacks": "sb3_knntd/callbacks", "zoo_configs": "sb3_knntd/zoo_configs"}
 
 
@@ -62,7 +62,7 @@ def public_members(cls: type) -> Iterator[tuple[str, Any]]:
                     yield name, getattr(cls, name)
 
 
-def test_modules_say_what_they_are() -> None:
+def test_modules_have_docstrings() -> None:
     silent = [module.__name__ for module in modules() if not module.__doc__]
     assert not silent
 
@@ -71,7 +71,7 @@ def test_public_names_are_documented() -> None:
     silent = []
     for name in sb3_knntd.__all__:
         value = getattr(sb3_knntd, name)
-        # A class without its own docstring shows that of its base.
+        # A class without a docstring inherits that of its base class.
         if not vars(value).get("__doc__"):
             silent.append(name)
         silent += [f"{name}.{member}" for member, function in public_members(value) if not inspect.getdoc(function)]
@@ -89,7 +89,7 @@ def test_wheel_holds_everything(tmp_path: pathlib.Path) -> None:
     setuptools = pytest.importorskip("setuptools")
     if int(setuptools.__version__.split(".")[0]) < 77:
         pytest.skip("this setuptools is too old to build the package")
-    # Built from a copy, for setuptools leaves its own folders beside what it builds.
+    # Build from a copy, because setuptools creates folders beside the sources.
     source = tmp_path / "source"
     source.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -114,7 +114,7 @@ def test_wheel_holds_everything(tmp_path: pathlib.Path) -> None:
     assert "sb3_knntd/callbacks/__init__.py" in expected
     assert not expected - held
     assert any(name.endswith("LICENSE") for name in held)
-    # The folders are found under the package only: a bare `callbacks` would be everybody's.
+    # The folders are installed only inside the package: a top-level `callbacks` would collide with others.
     assert {name.split("/")[0] for name in held if ".dist-info" not in name} == {"sb3_knntd"}
 
 

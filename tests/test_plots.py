@@ -1,4 +1,4 @@
-"""Pictures: what is drawn is what was given, or what the policy says."""
+"""Plots show the given data or the values of the policy."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from sb3_knntd.plots import (
 
 
 class StillEnv(gym.Env[np.ndarray, int]):
-    """Has spaces, and nothing happens in it."""
+    """An environment with spaces that is never stepped."""
 
     def __init__(self, low: list[float], high: list[float], actions: spaces.Discrete) -> None:
         self.observation_space = spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
@@ -94,7 +94,7 @@ def test_the_median_is_over_a_tenth_of_the_episodes(n_episodes: int, window: int
     assert f"running median of {window} episodes" in lines_of(axes)
 
 
-def test_a_learning_curve_without_episodes_says_so() -> None:
+def test_a_learning_curve_without_episodes_is_an_error() -> None:
     axes = plot_learning_curve([], [], baseline=1.0)
     assert [text.get_text() for text in axes.texts] == ["no episode has ended"]
     assert plot_learning_curve([], []).get_legend() is None
@@ -105,7 +105,7 @@ def test_a_learning_curve_needs_a_step_for_each_return() -> None:
         plot_learning_curve([1, 2], [1, 2, 3])
 
 
-def test_curves_are_drawn_where_they_are_told_to() -> None:
+def test_curves_are_drawn_on_given_axes() -> None:
     axes = new_figure(4, 3).add_subplot()
     assert plot_learning_curve([1], [1.0], axes=axes) is axes
     pair = tuple(new_figure(8, 3).subplots(1, 2))
@@ -116,14 +116,14 @@ def test_curves_are_drawn_where_they_are_told_to() -> None:
 # -------------------------------------------------------------- value function
 
 
-def test_the_grid_holds_what_the_policy_says() -> None:
+def test_the_grid_has_the_values_of_the_policy() -> None:
     model = make_model([0, -5], [2, 5])
     fill(model, lambda points: np.stack([points[:, 0], -points[:, 1], points.sum(axis=1)], axis=1))
     grid = value_grid(model, resolution=8)
     assert grid.extent == (0, 2, -5, 5)
     assert grid.fixed == {}
     assert grid.q_values.shape == (8, 8, 3)
-    # Row 6 from below is at -5 + 6.5/8 of the height, column 1 at 1.5/8 of the width.
+    # Row 6 from the bottom is at -5 + 6.5/8 of the height, column 1 at 1.5/8 of the width.
     here = model.policy.q_values(np.array([2 * 1.5 / 8, -5 + 10 * 6.5 / 8]))[0]
     np.testing.assert_array_equal(grid.q_values[6, 1], here)
 
@@ -136,7 +136,7 @@ def test_dimensions_may_be_exchanged() -> None:
     np.testing.assert_array_equal(turned.q_values, straight.q_values.transpose(1, 0, 2))
 
 
-def test_other_dimensions_stand_in_the_middle_or_where_they_are_told_to() -> None:
+def test_other_dimensions_are_fixed_in_the_middle_or_at_given_values() -> None:
     model = make_model([0, -5, 10, 2], [2, 5, 20, 3], points=4)
     fill(model, lambda points: np.stack([points.sum(axis=1)] * 3, axis=1))
     grid = value_grid(model, dims=(3, 1), fixed={2: 18}, resolution=4)
@@ -160,7 +160,7 @@ def test_the_picture_is_the_greatest_value_and_its_action() -> None:
     assert not axes[0].texts
 
 
-def test_where_nothing_was_learned_nothing_is_claimed() -> None:
+def test_unvisited_cells_are_masked() -> None:
     model = make_model([0, 0], [1, 1], initial_value=2.0)
     fill(model, lambda points: np.where(points[:, :1] < 0.5, -1.0, 2.0) * np.ones(3))
     axes = plot_value_function(model, resolution=40)
@@ -225,7 +225,7 @@ def test_action_colors_differ_in_lightness() -> None:
     assert np.diff(lightness).min() > 0.08
 
 
-def test_telling_dimensions_are_those_the_value_changes_along() -> None:
+def test_selected_dimensions_are_those_the_value_depends_on() -> None:
     model = make_model([0] * 4, [1] * 4, points=4, n_actions=2)
     assert telling_dims(model) == (0, 1)
     fill(model, lambda points: np.stack([points @ [0.1, 3.0, 0.0, 2.0]] * 2, axis=1))
@@ -245,7 +245,7 @@ def test_telling_dimensions_are_those_the_value_changes_along() -> None:
         ({"resolution": 0}, "resolution must be an integer from 1 to 4096; got 0"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(arguments: dict[str, Any], message: str) -> None:
+def test_invalid_plots_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         plot_value_function(make_model([0, 0, 0], [1, 1, 1], points=3), **arguments)
 
@@ -256,7 +256,7 @@ def test_a_value_function_needs_two_dimensions(env: Any) -> None:
         plot_value_function(KNNTD(env))
 
 
-# --------------------------------------------------------------------- manners
+# ---------------------------------------------------------------- global state
 
 
 def test_no_window_and_no_global_state_is_touched() -> None:
@@ -279,18 +279,18 @@ def test_the_example_draws_a_value_function(tmp_path: Path, monkeypatch: pytest.
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_settings_of_the_user_are_left_alone() -> None:
+def test_settings_of_the_user_are_not_changed() -> None:
     before = dict(matplotlib.rcParams)
     plot_learning_curve([1, 2], [1.0, 2.0])
     plot_value_function(make_model([0, 0], [1, 1]), resolution=5)
     assert dict(matplotlib.rcParams) == before
 
 
-# -------------------------------------------------------- what is not installed
+# ------------------------------------------------------------ missing packages
 
 
 def hide(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
-    """Have it not installed, whatever of it was imported before."""
+    """Simulate that a package is not installed."""
     for name in [package, *(name for name in sys.modules if name.startswith(f"{package}."))]:
         monkeypatch.setitem(sys.modules, name, None)
 
@@ -304,7 +304,7 @@ def hide(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
     ],
     ids=["value function", "learning curve", "map callback"],
 )
-def test_without_matplotlib_pictures_say_what_to_install(
+def test_without_matplotlib_plots_say_what_to_install(
     draw: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Asking a model what to do."""
+"""``predict`` and the inspection methods of the policy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Algorithm = type[KNNTD | ExA]
 MakeGrid = Callable[..., gym.Env[Any, Any]]
 MakeModel = Callable[..., KNNTD | ExA]
 
-# What only an algorithm of Discrete actions has.
+# Only for algorithms with Discrete actions.
 KNNTD_ONLY = pytest.mark.parametrize("algorithm", [KNNTD])
 
 
@@ -71,12 +71,12 @@ def test_deterministic_action_is_the_best_by_q_values(model: KNNTD | ExA, observ
 def test_deterministic_prediction_breaks_ties_to_the_lowest_index(
     make_model: MakeModel, observations: np.ndarray
 ) -> None:
-    # Nothing learned: all actions are worth the same, and training would draw from them.
+    # Without learning all actions have equal values, and training would break ties at random.
     actions, _ = make_model(tie_break="random").predict(observations, deterministic=True)
     assert not actions.any()
 
 
-def test_prediction_leaves_the_model_as_it_is(
+def test_prediction_does_not_change_the_model(
     model: KNNTD | ExA, make_model: MakeModel, observations: np.ndarray
 ) -> None:
     model.predict(observations)
@@ -111,7 +111,7 @@ def test_single_observation_is_perceived_as_one_row(model: KNNTD | ExA, observat
     assert model.policy.q_values(observations[0]).shape == (1, 3)
 
 
-def test_tensors_are_perceived_as_arrays_are(model: KNNTD | ExA, observations: np.ndarray) -> None:
+def test_tensors_are_perceived_like_arrays(model: KNNTD | ExA, observations: np.ndarray) -> None:
     assert th.equal(model.policy.q_values(th.from_numpy(observations)), model.policy.q_values(observations))
 
 
@@ -133,7 +133,7 @@ def test_plain_int_is_a_state(algorithm: Algorithm, make_grid: MakeGrid) -> None
 
 
 class ShiftedActions(gym.ActionWrapper[Any, Any, Any]):
-    """The same environment with its actions numbered from ``first``; any other number is an error."""
+    """The same environment with actions numbered from ``first``; other numbers are an error."""
 
     def __init__(self, env: gym.Env[Any, Any], first: int) -> None:
         super().__init__(env)
@@ -178,7 +178,7 @@ def test_evaluate_policy(model: KNNTD | ExA, make_venv: Callable[..., VecEnv], n
     assert mean == pytest.approx(np.mean(returns))
 
 
-def test_tables_may_have_half_the_size(make_model: MakeModel, observations: np.ndarray) -> None:
+def test_tables_may_be_float32(make_model: MakeModel, observations: np.ndarray) -> None:
     half = make_model(policy_kwargs={"dtype": th.float32}).learn(100)
     full = make_model().learn(100)
     assert full.policy.q_table.dtype == th.float64

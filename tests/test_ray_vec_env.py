@@ -1,4 +1,4 @@
-"""RayVecEnv: what SubprocVecEnv does, on a Ray cluster on loopback, some of whose processes and nodes die."""
+"""RayVecEnv: behaves like SubprocVecEnv, on a local Ray cluster, some of whose processes and nodes die."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from sb3_knntd import KNNTD, ExA
 from sb3_knntd.distributed import ray_vec_env
 from sb3_knntd.distributed.ray_vec_env import RayVecEnv
 
-#: Nothing is reserved: the tests' machine has few cores, and nobody else is on the cluster.
+#: Reserve no resources: test machines have few cores, and nothing else runs on the cluster.
 SHARED: dict[str, Any] = {"num_cpus": 0}
 N_ENVS = 3
 PROBES: list[Callable[[], gym.Env[Any, Any]]] = [
@@ -54,14 +54,14 @@ PROBES: list[Callable[[], gym.Env[Any, Any]]] = [
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """A head that computes nothing, and a node; this process is connected."""
+    """A cluster of a head without CPUs and one node; this process is connected to it."""
     with loopback_cluster(num_cpus=2, resources={"simulator": 2}) as made:
         yield made
 
 
 @pytest.fixture(scope="module")
 def venv(cluster: Cluster) -> Iterator[RayVecEnv]:
-    """Three environments that show what is done to them; tests leave them as they like."""
+    """Three environments that record what is done to them; tests may leave them in any state."""
     made = RayVecEnv(PROBES, **SHARED)
     yield made
     made.close()
@@ -69,7 +69,7 @@ def venv(cluster: Cluster) -> Iterator[RayVecEnv]:
 
 @pytest.fixture(scope="module")
 def model_venv() -> Iterator[SubprocVecEnv]:
-    """The same environments as SB3 has them, which is how they ought to be."""
+    """The same environments in SB3's SubprocVecEnv, the reference."""
     made = SubprocVecEnv(PROBES)
     yield made
     made.close()
@@ -84,7 +84,7 @@ def either(request: pytest.FixtureRequest) -> VecEnv:
 
 @pytest.fixture
 def make_mortal(cluster: Cluster) -> Iterator[Callable[..., RayVecEnv]]:
-    """Makes ``make_mortal(n_envs, **arguments)``: environments that can be made to die."""
+    """A function ``make_mortal(n_envs, **arguments)`` that makes environments that can die."""
     made: list[RayVecEnv] = []
 
     def make(n_envs: int = 1, length: int = 10, **arguments: Any) -> RayVecEnv:
@@ -97,7 +97,7 @@ def make_mortal(cluster: Cluster) -> Iterator[Callable[..., RayVecEnv]]:
 
 
 def assert_same(one: Any, other: Any) -> None:
-    """Equal to the last bit, whatever it is made of, but for clock times."""
+    """Assert bitwise equality of nested values, except for clock times."""
     if isinstance(one, dict):
         assert one.keys() == other.keys()
         for key in one.keys() - {"t"}:
@@ -114,7 +114,7 @@ def assert_same(one: Any, other: Any) -> None:
 
 
 def live(venv: VecEnv, n_steps: int, seed: int = 3) -> Iterator[Any]:
-    """What comes of a reset and of random steps."""
+    """The results of a reset and of random steps."""
     yield venv.reset()
     yield venv.reset_infos
     venv.action_space.seed(seed)
@@ -130,7 +130,7 @@ def test_same_steps(venv: RayVecEnv, model_venv: SubprocVecEnv) -> None:
     for each in (venv, model_venv):
         assert each.seed(11) == [11, 12, 13]
         each.set_options([{"a": 1}, {}, {"b": np.arange(3)}])
-    # Seeds and options hold for one reset, and what is random goes on from there: hence twice.
+    # Seeds and options apply to one reset, and the random numbers continue from there; therefore twice.
     for _ in range(2):
         for one, other in zip(live(venv, 14), live(model_venv, 14), strict=True):
             assert_same(one, other)
@@ -151,7 +151,7 @@ def test_seeds_and_options_reach_one_reset(either: VecEnv) -> None:
 
 def test_terminal_observations(either: VecEnv) -> None:
     observations = either.reset()
-    ended = {0: 4, 1: 5, 2: 6}  # the last by a wrapper's limit of time
+    ended = {0: 4, 1: 5, 2: 6}  # the last by a TimeLimit wrapper
     for step in range(1, 7):
         actions = np.zeros((N_ENVS, 3), np.float32)
         observations, rewards, dones, infos = either.step(actions)
@@ -176,7 +176,7 @@ def test_attributes_and_methods(venv: RayVecEnv, model_venv: SubprocVecEnv, indi
         lambda each: each.get_attr("length", indices),
         lambda each: each.env_method("scaled", 2.0, indices=indices, name=1.0),
         lambda each: each.env_is_wrapped(Monitor, indices),
-        # Not TimeLimit: once RL Zoo is imported, gymnasium has another one, in this process alone.
+        # Not TimeLimit: RL Zoo replaces it in gymnasium, but only in this process.
         lambda each: each.env_is_wrapped(gym.wrappers.OrderEnforcing, indices),
     ):
         assert_same(ask(venv), ask(model_venv))
@@ -235,7 +235,7 @@ def test_structured_observations(cluster: Cluster) -> None:
             each.seed(1)
         for one, other in zip(live(made, 6), live(expected, 6), strict=True):
             assert_same(one, other)
-        # Ray's own arrays are read-only. These are the user's.
+        # Ray's arrays are read-only; returned arrays must be writable.
         image = made.step(np.array([1]))[3][0]["seen"]["image" if isinstance(space, spaces.Dict) else 2]
         image += 1
     made.close()
@@ -253,7 +253,7 @@ def test_same_learning(
             arguments["policy"] = "MlpPolicy"
         else:
             arguments |= {"points": 4, "bounds": ([-5] * 3, [5] * 3)}
-        if learner is KNNTD:  # the walk goes where it likes besides
+        if learner is KNNTD:  # the random walk visits other observations, too
             monkeypatch.setattr(each, "action_space", spaces.Discrete(3))
         model = learner(env=each, **arguments).learn(900)
         learned.append(model.policy.state_dict())
@@ -268,7 +268,7 @@ def test_same_learning(
 # ---------------------------------------------------- exceptions, and the end
 
 
-def test_what_an_environment_raises_reaches_the_user(venv: RayVecEnv) -> None:
+def test_errors_of_environments_reach_the_user(venv: RayVecEnv) -> None:
     actions = np.zeros((N_ENVS, 3), np.float32)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -280,13 +280,13 @@ def test_what_an_environment_raises_reaches_the_user(venv: RayVecEnv) -> None:
             venv.step(np.zeros((N_ENVS, 5), np.float32))
         with pytest.raises(ValueError, match="zip"):
             venv.step(actions[:2])
-        # They live, and none was made anew.
+        # They are alive, and none was restarted.
         venv.reset()
         assert [info["steps"] for info in venv.step(actions)[3]] == [1, 1, 1]
         assert venv.restarts == [0, 0, 0]
 
 
-def test_a_reset_ends_what_is_going_on(venv: RayVecEnv) -> None:
+def test_a_reset_cancels_running_steps(venv: RayVecEnv) -> None:
     actions = np.zeros((N_ENVS, 3), np.float32)
     venv.reset()
     venv.step_async(actions)
@@ -296,7 +296,7 @@ def test_a_reset_ends_what_is_going_on(venv: RayVecEnv) -> None:
     assert [info["steps"] for info in venv.step(actions)[3]] == [1, 1, 1]
 
 
-def test_what_the_making_raises_reaches_the_user(cluster: Cluster) -> None:
+def test_errors_of_constructors_reach_the_user(cluster: Cluster) -> None:
     with pytest.raises(TypeError, match="unexpected keyword argument 'mass'"):
         RayVecEnv([partial(ProbeEnv, mass=3)], **SHARED)
 
@@ -342,7 +342,7 @@ def test_no_room_in_the_cluster(cluster: Cluster, monkeypatch: pytest.MonkeyPatc
         RayVecEnv(PROBES[:2], actor_options=options, placement_timeout=0.6, **SHARED)
 
 
-# ----------------------------------------------------------------- what dies
+# ------------------------------------------------------------------- deaths
 
 
 def kill(venv: RayVecEnv, index: int) -> None:
@@ -370,12 +370,12 @@ def test_a_death_ends_an_episode(make_mortal: Callable[..., RayVecEnv]) -> None:
     before = venv.step(actions)[0]
     with pytest.warns(UserWarning, match=r"environment 1 died and is made anew \(restart 1\): .*its worker process"):
         observations, rewards, dones, infos = venv.step(actions)
-    # Nothing happened to the other, and this one's episode is cut off at the last that was seen.
+    # The other environment is not affected, and this one's episode is truncated at its last observation.
     assert (observations[0, 1], rewards.tolist(), dones.tolist()) == (3, [-1.0, 0.0], [False, True])
     assert infos[0] == {"TimeLimit.truncated": False}
     assert (infos[1]["TimeLimit.truncated"], infos[1]["env_restarted"]) == (True, True)
     np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
-    # The new one begins elsewhere, with a seed of its own and all that was set.
+    # The restarted environment has a new seed and all attributes that were set.
     assert observations[1, 1] == 0
     assert observations[1, 0] != first[1, 0]
     assert venv.reset_infos[1] == {"pid": venv.get_attr("pid")[1]}
@@ -384,10 +384,10 @@ def test_a_death_ends_an_episode(make_mortal: Callable[..., RayVecEnv]) -> None:
     assert venv.get_attr("knob") == ["untouched", "turned"]
     assert venv.restarts == [0, 1]
 
-    # Once an episode has come to its end, deaths are counted afresh.
+    # A finished episode resets the count of deaths.
     assert [venv.step(actions)[2].tolist() for _ in range(10)][9] == [False, True]
 
-    # A death between steps shows as soon as anything is asked, and ends the episode in the next step.
+    # A death between steps is noticed at the next call, and truncates the episode in the next step.
     kill(venv, 1)
     with pytest.warns(UserWarning, match="restart 2"):
         assert venv.get_attr("knob") == ["untouched", "turned"]
@@ -399,7 +399,7 @@ def test_a_death_ends_an_episode(make_mortal: Callable[..., RayVecEnv]) -> None:
     assert (dones[1], observations[1, 1]) == (True, 0)
     assert not any("env_restarted" in info for _ in range(10) for info in venv.step(actions)[3])
 
-    # Silence is death. In a reset, the same reset is asked of the new one.
+    # A timeout counts as death. In a reset, the restarted environment is reset in the same way.
     venv.env_method("__setattr__", "hangs", True, indices=[1])
     venv.seed(7)
     venv.timeout = 3.0
@@ -409,14 +409,14 @@ def test_a_death_ends_an_episode(make_mortal: Callable[..., RayVecEnv]) -> None:
     assert venv.get_attr("seeds", 1) == [[8]]
     assert "env_restarted" not in venv.step(actions)[3][1]
 
-    # What dies again and again is given up.
+    # Too many deaths in a row raise an error.
     with pytest.raises(RuntimeError, match=r"environment 1 has died 2 times in a row .* max_restarts is 1\. Its last"):
         venv.env_method("die", indices=[1])
     with pytest.raises(RuntimeError, match="environment 1 has died 2 times"):
         venv.step(actions)
 
 
-def test_monitors_files_keep_their_rows(cluster: Cluster, tmp_path: Path) -> None:
+def test_monitor_files_keep_their_rows(cluster: Cluster, tmp_path: Path) -> None:
     folder, closed = tmp_path / "monitor", tmp_path / "closed"
     venv = make_vec_env(
         MortalEnv, 1, env_kwargs={"length": 4}, monitor_dir=str(folder), vec_env_cls=RayVecEnv, vec_env_kwargs=SHARED
@@ -443,7 +443,7 @@ def test_monitors_files_keep_their_rows(cluster: Cluster, tmp_path: Path) -> Non
 
 
 class Killer(BaseCallback):
-    """Kills a process, later a node, and notes which episodes were cut off."""
+    """Kills a process and later a node, and records which episodes were truncated."""
 
     def __init__(self, venv: RayVecEnv, cluster: Cluster, doomed: Any) -> None:
         super().__init__()
@@ -480,7 +480,7 @@ def test_learning_survives_a_process_and_a_node(cluster: Cluster, make_mortal: C
     assert [call for call, _ in killer.cut_off] == [36, 76]
     assert doomed.node_id not in venv.get_attr("node")
     assert sorted(venv.restarts) == [1, 1]
-    # Each step costs one: what is left of ten is worth its number.
+    # Each step costs 1: the value is the number of remaining steps of ten.
     lengths = [info["l"] for info in model.ep_info_buffer or ()]
     assert 6 in lengths, "the episode that was cut off counts"
     assert max(lengths) == 10
@@ -489,7 +489,7 @@ def test_learning_survives_a_process_and_a_node(cluster: Cluster, make_mortal: C
     assert values[0] < values[1] < 0
 
 
-# -------------------------------------------------------- where there is Ray
+# --------------------------------------------------------------- Ray itself
 
 
 def test_ray_is_imported_only_when_needed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -502,7 +502,7 @@ def test_ray_is_imported_only_when_needed(monkeypatch: pytest.MonkeyPatch) -> No
         importlib.import_module("sb3_knntd.distributed.ray_vec_env")
 
 
-def test_given_no_cluster_it_starts_its_own(cluster: Cluster) -> None:
+def test_without_a_cluster_it_starts_one(cluster: Cluster) -> None:
     program = (
         "import ray; from sb3_knntd.distributed.ray_jobs import connect; print(connect(), ray.cluster_resources())"
     )
@@ -532,8 +532,8 @@ print("done", venv.restarts)
 
 
 @pytest.mark.slow
-def test_a_cluster_elsewhere(cluster: Cluster) -> None:
-    """By Ray's own client, from a program that is no part of the cluster."""
+def test_a_remote_cluster(cluster: Cluster) -> None:
+    """Connect with Ray's client, from a program outside the cluster."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

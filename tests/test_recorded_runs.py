@@ -1,4 +1,4 @@
-"""Results stay what they were: the tables of short runs, to the bit where they do not depend on the machine."""
+"""Results do not change between versions: the tables of short runs, bit for bit if they are machine-independent."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def test_tile_coding_is_as_recorded() -> None:
 
 
 @pytest.mark.parametrize("name", SAVED)
-def test_models_saved_by_the_first_version_go_on_as_they_did(name: str) -> None:
+def test_models_saved_by_the_first_version_continue_unchanged(name: str) -> None:
     with np.load(CONTINUED) as recorded:
         np.testing.assert_array_equal(continued(name), recorded[name])
 
 
-def test_a_filter_saved_by_the_first_version_goes_on_as_it_did() -> None:
+def test_a_filter_saved_by_the_first_version_continues_unchanged() -> None:
     with np.load(CONTINUED) as recorded:
         np.testing.assert_array_equal(
             filtered(VecDeltaFilter.load(FILTER, make_venv(**LENGTHS), trusted=True)), recorded["filter"]

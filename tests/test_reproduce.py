@@ -1,4 +1,4 @@
-"""`sb3-knntd reproduce`, used as a user would, and what it computes from the results."""
+"""`sb3-knntd reproduce`, as a user runs it, and its statistics."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def stored(folder: Path, algorithm: str, seed: int) -> Any:
 
 
 def curves(table: list[dict[str, str]], algorithm: str) -> dict[int, list[int]]:
-    """Steps of each episode, by seed, as the table has them."""
+    """Steps of each episode in the table, by seed."""
     found: dict[int, list[int]] = {}
     for row in table:
         if row["algorithm"] == algorithm:
@@ -65,7 +65,7 @@ def verdict_of(folder: Path) -> str:
 
 
 def check_files(folder: Path, output: str, names: Sequence[str]) -> None:
-    """They are all there and told of, the picture is one, and the verdict that is printed is that of the file."""
+    """All files exist and are listed, the plot is a PNG, and the printed verdict is that of the file."""
     for name in names:
         assert str(folder / name) in output
     assert sorted(path.name for path in folder.iterdir()) == sorted([*names, "seeds"])
@@ -95,7 +95,7 @@ def test_figure_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def late_ratios(table: list[dict[str, str]], dimension: str) -> list[float]:
-    """Of each seed the error of the filtered over that of the raw signal, in the last 20 episodes taken together."""
+    """For each seed the error of the filtered signal divided by that of the raw signal, over the last 20 episodes."""
     found = []
     for seed in dict.fromkeys(row["seed"] for row in table):
         late = [row for row in table if row["seed"] == seed and row["dimension"] == dimension][-20:]
@@ -117,7 +117,7 @@ def test_figure_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         for episode in range(1, 23)
         for dimension in ("position", "velocity")
     ]
-    # Beta(5, 2) deviates by 0.16, and the problem's noise divider is between 5 and 20; of short episodes a bit more.
+    # Beta(5, 2) has a standard deviation of 0.16, and the noise divider is in [5, 20]; short episodes vary a bit more.
     for dimension, width in (("position", 1.8), ("velocity", 0.14)):
         raw = [float(row["raw"]) / (0.16 * width) for row in table if row["dimension"] == dimension]
         assert 1 / 20 / 1.4 < min(raw) <= max(raw) < 1 / 5 * 1.4
@@ -157,7 +157,7 @@ def test_figure_4(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("parts", [{}, {"offset": False}, {"noise": False}, {"noise": False, "offset": False}])
-def test_what_is_the_same_in_all_observations_counts_as_no_error(parts: dict[str, bool]) -> None:
+def test_a_constant_bias_does_not_count_as_error(parts: dict[str, bool]) -> None:
     env = gym.make("sb3_knntd/GeneralizedMountainCar-v0", problem=3, **parts)
     errors = []
     for seed in range(400):
@@ -169,7 +169,7 @@ def test_what_is_the_same_in_all_observations_counts_as_no_error(parts: dict[str
     assert (constant != 0).all() == (len(parts) < 2)
 
 
-def test_what_the_wall_does_to_estimates_can_be_left_out() -> None:
+def test_steps_at_the_wall_can_be_excluded() -> None:
     true = np.tile([-1.0, 0.02], (40, 1))
     true[[20, 21]] = -1.2, 0.0
     wrong = np.where(np.arange(40)[:, None] % 2, 0.01, -0.01)
@@ -194,7 +194,7 @@ def test_signals_are_recorded_by_episode() -> None:
         for (observation, info), (true, raw, filtered) in zip(episode, signals, strict=True):
             np.testing.assert_array_equal(true, info["state"])
             np.testing.assert_allclose(raw + constant, info["raw_observation"])
-            # A filter that trusts nothing passes what it is given.
+            # Before warmup the filter passes its input unchanged.
             np.testing.assert_allclose(filtered + constant, observation)
             np.testing.assert_array_equal(filtered, raw)
 
@@ -285,14 +285,14 @@ def test_settings_are_those_of_the_paper() -> None:
     algorithm_5 = fig4["paper"]["knntd"]["filter"]
     assert (algorithm_5["gain"], algorithm_5["warmup"]) == (None, 0)
     assert (algorithm_5["points"], algorithm_5["n_neighbors"]) == ([20, 15], 4)
-    # The learner is figure 3's, and both variants differ in the filter alone: one is that of its defaults.
+    # The learner is that of figure 3. The variants differ only in the filter, one of which has its defaults.
     same = fig3.keys() - {"env", "env_kwargs"}
     assert {name: fig4["paper"]["knntd"][name] for name in same} == {name: fig3[name] for name in same}
     assert {**fig4["best"]["knntd"], "filter": algorithm_5} == fig4["paper"]["knntd"]
     assert fig4["best"]["knntd"]["filter"].keys() == {"bounds"}
     model = make_model("exa", load_settings("fig7")["paper"]["exa"], 0, lambda env: env)
     np.testing.assert_allclose(model.policy.action_points[0], np.linspace(-1, 1, 11))
-    # The best is to be had with as many points and neighbours.
+    # The best settings use the same number of points and neighbours.
     best = load_settings("fig3")["best"]["knntd"]
     assert (math.prod(best["points"]), best["n_neighbors"]) == (300, 4)
 
@@ -307,20 +307,20 @@ def test_points_and_schedules_of_a_setting() -> None:
     setting = {**load_settings("fig3")["best"]["knntd"], "episodes": 50}
     setting["learning_rate"] = {"start": 0.8, "end": 0.2, "steps": 5000}
     model = make_model("knntd", setting, 0, lambda env: env)
-    # Over the first 5000 of 50 x 1000 steps, whatever the number of episodes.
+    # Over the first 5000 of 50 x 1000 steps, for any number of episodes.
     for step, rate in ((0, 0.8), (2500, 0.5), (5000, 0.2), (20_000, 0.2)):
         assert model.lr_schedule(1 - step / 50_000) == pytest.approx(rate)
 
 
-def test_the_first_success_and_what_follows() -> None:
+def test_the_first_success_and_the_next_episodes() -> None:
     assert success([10, 1000, *[1000] * 15, *[999] * 15, 1000]) == (2, 0.5)
     assert success([1000] + [1000] * 30) == (1, 1.0)
-    # Too late to be followed for 30 episodes, or not at all.
+    # Too late to be followed by 30 episodes, or no success at all.
     assert success([10, *[1000] * 30]) == (math.inf, 0.0)
     assert success([10] * 40) == (math.inf, 0.0)
 
 
-def test_quantiles_count_what_never_came() -> None:
+def test_quantiles_with_infinite_values() -> None:
     values = [3.0, 9.0, 1.0, 4.0]
     for share in (0.0, 0.1, 0.5, 0.77, 1.0):
         assert quantile(values, share) == pytest.approx(np.quantile(values, share))
@@ -337,7 +337,7 @@ def test_smoothness() -> None:
     assert used_share(np.linspace(-1, 1, 1000).tolist()) == 1.0
 
 
-def test_only_an_episode_that_the_time_limit_ends_is_recorded() -> None:
+def test_only_an_episode_that_reaches_the_time_limit_is_recorded() -> None:
     env = FullEpisodeRecorder(gym.make("sb3_knntd/CartPole-v0", n_forces=3, max_episode_steps=6, failure_angle=1))
     for forces, recorded in (([2] * 6, False), ([1, 2, 0, 2, 0, 1], True), ([1] * 6, True)):
         env.reset()
@@ -366,7 +366,7 @@ def test_only_an_episode_that_the_time_limit_ends_is_recorded() -> None:
         (["fig3", "--workers", "none"], "--workers"),
     ],
 )
-def test_what_cannot_be_is_refused(
+def test_invalid_arguments_are_refused(
     argv: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as refused:
@@ -396,7 +396,7 @@ def test_missing_extra_packages_are_named(
     assert 'tqdm not installed: pip install "sb3-knntd[extra]"' in capsys.readouterr().err
 
 
-def test_a_failed_seed_is_told_and_leaves_no_verdict(
+def test_a_failed_seed_is_reported_and_leaves_no_verdict(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = load_settings("fig3")
@@ -409,7 +409,7 @@ def test_a_failed_seed_is_told_and_leaves_no_verdict(
     assert [path.name for path in (tmp_path / "fig3" / "paper").iterdir()] == ["seeds"]
 
 
-def test_ctrl_c_says_how_to_go_on(tmp_path: Path) -> None:
+def test_ctrl_c_says_how_to_continue(tmp_path: Path) -> None:
     program = "import sys; from sb3_knntd.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "reproduce", "fig6", "--seeds", "50", "--workers", "1", "--out", "runs"]
     process = subprocess.Popen(
@@ -436,7 +436,7 @@ def test_figure_3_at_its_best(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.slow
 def test_figure_4_with_the_paper_s_settings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """At first Algorithm 5 adds error; at last it takes some out of the position, and none out of the velocity."""
+    """Algorithm 5 first increases the error; later it reduces that of the position, but not that of the velocity."""
     assert main(["reproduce", "fig4", "--out", str(tmp_path)]) == 0
     table = rows(tmp_path / "fig4" / "paper" / "table.csv")
     first = [float(row["filtered"]) / float(row["raw"]) for row in table if row["episode"] == "1"]
@@ -471,7 +471,7 @@ def test_figure_6_at_its_best(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("figure", ["fig3", "fig6"])
-def test_with_the_paper_s_settings_its_figures_are_no_typical_seed_s(
+def test_with_the_paper_s_settings_its_results_are_not_typical(
     figure: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["reproduce", figure, "--out", str(tmp_path)]) == 0

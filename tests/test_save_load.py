@@ -1,4 +1,4 @@
-"""Nothing is lost: files hold the whole model, survive interruption, and are refused where they do not fit."""
+"""Files contain the whole model, survive interruption, and are refused if they do not match."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def algorithm(request: pytest.FixtureRequest) -> Algorithm:
 
 
 SCATTERED = np.random.default_rng(5).uniform(DriftEnv.LOW, DriftEnv.HIGH, size=(30, 2))
-# Each makes a model differ from the others in what has to be kept.
+# Each variant has other state that must be saved.
 SETTINGS: dict[str, dict[str, Any]] = {
     "defaults": {},
     "constant epsilon": {"exploration_initial_eps": 0.4, "exploration_final_eps": 0.4},
@@ -75,11 +75,11 @@ def same_table(first: KNNTD | ExA, second: KNNTD | ExA) -> bool:
 
 
 def go_on(algorithm: Algorithm, path: pathlib.Path, venv: VecEnv, n_steps: int) -> KNNTD | ExA:
-    """Load, and learn on from where it was in an environment that is still in the state it was in."""
+    """Load, and continue in an environment that is still in the state it was in."""
     return algorithm.load(path, env=venv, force_reset=False).learn(n_steps, reset_num_timesteps=False)
 
 
-# ------------------------------------------------------------ what is kept
+# ------------------------------------------------------------ saved state
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
@@ -92,13 +92,13 @@ def test_interrupted_run_equals_the_uninterrupted(
     settings: dict[str, Any],
     n_envs: int,
 ) -> None:
-    # Odd numbers, so that episodes are under way in all environments.
+    # Odd numbers of steps, to stop in the middle of episodes in all environments.
     whole = make_model(make_venv(n_envs), **settings)
     whole.save(tmp_path / "start")
     whole.learn(101).learn(101, reset_num_timesteps=False)
 
     venv = make_venv(n_envs)
-    # Both begin with the same random state also where no seed was given.
+    # Both start with the same random state, even without a seed.
     algorithm.load(tmp_path / "start", env=venv).learn(101).save(tmp_path / "middle")
     resumed = go_on(algorithm, tmp_path / "middle", venv, 101)
     assert same_table(resumed, whole)
@@ -116,7 +116,7 @@ def test_interrupted_run_equals_the_uninterrupted(
         (ExA, "MountainCarContinuous-v0", {"points": (6, 6), "n_neighbors": 4}),
     ],
 )
-def test_interrupted_run_in_environments_with_chance(
+def test_interrupted_run_in_stochastic_environments(
     algorithm: Algorithm, tmp_path: pathlib.Path, env_id: str, arguments: dict[str, Any], n_envs: int
 ) -> None:
     def make() -> VecEnv:
@@ -166,8 +166,8 @@ def test_interrupted_run_in_normalised_environments(
         {"points": np.random.default_rng(0).uniform(-1.0, 1.0, (50, 2)), "search": "brute"},
     ],
 )
-def test_a_deep_copy_goes_on_alike_and_for_itself(make_model: MakeModel, arguments: dict[str, Any]) -> None:
-    # Ends within an episode.
+def test_a_deep_copy_continues_independently(make_model: MakeModel, arguments: dict[str, Any]) -> None:
+    # Stop in the middle of an episode.
     model = make_model(**arguments).learn(155)
     before, other = model.policy.q_table.clone(), copy.deepcopy(model)
     other.learn(200, reset_num_timesteps=False)
@@ -177,7 +177,7 @@ def test_a_deep_copy_goes_on_alike_and_for_itself(make_model: MakeModel, argumen
     assert not th.equal(model.policy.q_table, before)
 
 
-def test_saving_is_an_observer(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_saving_does_not_change_the_model(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     saving = make_model().learn(100)
     saving.save(tmp_path / "seen")
     saving.learn(100, reset_num_timesteps=False)
@@ -185,7 +185,7 @@ def test_saving_is_an_observer(make_model: MakeModel, tmp_path: pathlib.Path) ->
 
 
 class Snapshot(BaseCallback):
-    """Copies the environments after so many calls, for a run that goes on from the checkpoint of that step."""
+    """Copies the environments after a number of calls, for a run that continues from the checkpoint of that step."""
 
     def __init__(self, at: int) -> None:
         super().__init__()
@@ -221,7 +221,7 @@ def test_checkpoint_in_the_middle_of_learn(
     resumed = go_on(algorithm, tmp_path / f"rl_model_{done}_steps", snapshot.venv, total - done)
     assert resumed.num_timesteps == whole.num_timesteps == total
     assert same_table(resumed, whole)
-    # It is not equal for want of anything to learn after the checkpoint.
+    # The models are not equal merely because nothing was learned after the checkpoint.
     assert not same_table(whole, algorithm.load(tmp_path / f"rl_model_{done}_steps"))
 
 
@@ -275,7 +275,7 @@ def test_loaded_model_predicts_the_same(
 def test_measured_ranges_are_kept_without_the_environment(
     algorithm: Algorithm, make_venv: MakeVenv, tmp_path: pathlib.Path
 ) -> None:
-    # Nothing but the file knows of the normalisation that the ranges were measured under.
+    # Only the file contains the normalisation under which the ranges were measured.
     venv = VecNormalize(make_venv(2))
     model = algorithm(venv, points=5, seed=0).learn(1200)
     model.save(tmp_path / "model")
@@ -319,7 +319,7 @@ def test_arguments_are_kept(algorithm: Algorithm, make_model: MakeModel, tmp_pat
     assert (loaded.policy.q_table == 2.0).all()
 
 
-# ------------------------------------------------------- going on elsewhere
+# ---------------------------------------------------- other environments
 
 
 @pytest.mark.parametrize(("saved", "loaded"), [(1, 3), (3, 1), (2, 4)])
@@ -346,8 +346,8 @@ def test_other_number_of_environments_cannot_be_in_the_same_state(
     algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
 ) -> None:
     make_model(make_venv(1)).learn(100).save(tmp_path / "model")
-    # There is no state to go on from in three environments, and a load is all it takes to go on in others: so
-    # new episodes begin, as if a reset had been asked for.
+    # The saved state does not fit three environments, but loading into other environments is allowed. So
+    # new episodes start, as after a reset.
     model = algorithm.load(tmp_path / "model", env=make_venv(3), force_reset=False)
     model.learn(90, reset_num_timesteps=False)
     assert model.num_timesteps == 190
@@ -426,7 +426,7 @@ def test_attributes_are_changed_on_load(
     assert replaced.gamma == 0.5
 
 
-def test_file_can_be_read_by_whom_the_umask_lets(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
+def test_file_permissions_follow_the_umask(make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     umask = os.umask(0o022)
     try:
         make_model().save(tmp_path / "model")
@@ -444,7 +444,7 @@ def interrupt(*args: Any, **kwargs: Any) -> Any:
 
 @pytest.fixture
 def saved(make_model: MakeModel, tmp_path: pathlib.Path) -> pathlib.Path:
-    """A file with a model that has learned 100 steps, alone in its folder."""
+    """A file with a model trained for 100 steps, alone in its folder."""
     path = tmp_path / "saved" / "model.zip"
     make_model().learn(100).save(path)
     return path
@@ -534,7 +534,7 @@ def test_file_with_a_changed_byte(algorithm: Algorithm, saved: pathlib.Path, sha
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04", b"\x80\x04\x95"])
-def test_something_else_than_a_zip(algorithm: Algorithm, tmp_path: pathlib.Path, content: bytes) -> None:
+def test_a_file_that_is_not_a_zip(algorithm: Algorithm, tmp_path: pathlib.Path, content: bytes) -> None:
     (tmp_path / "model.zip").write_bytes(content)
     with pytest.raises(ValueError, match=r"model\.zip"):
         algorithm.load(tmp_path / "model.zip")
@@ -554,7 +554,7 @@ def test_zip_of_something_else(algorithm: Algorithm, tmp_path: pathlib.Path, dat
 def test_zip_without_one_of_its_parts(algorithm: Algorithm, saved: pathlib.Path, missing: str) -> None:
     with zipfile.ZipFile(saved) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
-    # SB3 writes, and does not need, an empty file of variables.
+    # SB3 writes an empty file of variables, but does not need it.
     names = [name for name in parts if name.endswith(missing) and name != "pytorch_variables.pth"]
     assert names
     for absent in names:
@@ -609,7 +609,7 @@ def test_refused_file_leaves_the_file(algorithm: Algorithm, saved: pathlib.Path)
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_another_number_of_neighbours_can_be_given_when_loading(tmp_path: pathlib.Path, compiled: bool) -> None:
-    """The table is the same; where the episodes were is not, and they begin anew."""
+    """The table is kept; new episodes start."""
     arguments: dict[str, Any] = {"points": (9, 9), "policy_kwargs": {"compiled": compiled}, "seed": 0}
     KNNTD("MountainCar-v0", n_neighbors=4, **arguments).learn(300).save(tmp_path / "four")
     venv = make_vec_env("MountainCar-v0", seed=0)

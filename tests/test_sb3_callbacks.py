@@ -1,4 +1,4 @@
-"""What SB3's users count on while a model learns: what callbacks are shown, and what they may change."""
+"""SB3's conventions during training: what callbacks see, and what they may change."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def algorithm(request: pytest.FixtureRequest) -> Algorithm:
 
 
 class TransitionRecorder(BaseCallback):
-    """Keeps (s, a, r, s') as users of SB3 do."""
+    """Records (s, a, r, s') as SB3 users do."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class TransitionRecorder(BaseCallback):
 
 
 class Act(BaseCallback):
-    """Does something once, at one step, in one of a callback's methods."""
+    """Does something once, at a given step, in one of its methods."""
 
     def __init__(self, at: int, do: Callable[[Any], object], method: str = "_on_step") -> None:
         super().__init__()
@@ -76,19 +76,19 @@ def test_a_callback_sees_the_observation_that_was_acted_on(
         np.testing.assert_array_equal(seen, step.observations)
         np.testing.assert_array_equal(actions, step.actions)
         np.testing.assert_array_equal(rewards, step.rewards)
-    # One transition begins where the last one led.
+    # Each transition starts where the previous one ended.
     for (_, _, _, led_to), (begins, _, _, _) in zip(recorder.transitions, recorder.transitions[1:], strict=False):
         assert led_to is begins
 
 
 @pytest.mark.parametrize("method", ["_on_rollout_start", "_on_step", "_on_rollout_end"])
-def test_where_a_callback_has_reset_to_the_next_step_starts(
+def test_the_next_step_starts_where_a_callback_has_reset_to(
     algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, method: str
 ) -> None:
     def reset(model: Any) -> None:
         model._last_obs = model.env.reset()
 
-    # Whatever was traced across the reset would show in every value.
+    # Traces kept across the reset would affect every value.
     settings: dict[str, Any] = {"gamma": 1.0, "trace_decay": 1.0, "exploration_final_eps": 0.1}
     venv, recorder = RecordingVecEnv(make_venv(lengths=[1000])), TransitionRecorder()
     model = make_model(venv, **settings).learn(20, callback=[Act(10, reset, method), recorder])
@@ -96,7 +96,7 @@ def test_where_a_callback_has_reset_to_the_next_step_starts(
     assert not np.array_equal(start, venv.steps[9].arrived)
     np.testing.assert_array_equal(recorder.transitions[10][0], start)
 
-    # It is as if learning had ended there, and had begun again in environments that were reset.
+    # The same as if training had stopped there and had started again with reset environments.
     twin = make_model(make_venv(lengths=[1000]), **settings).learn(10)
     twin.set_env(twin.get_env())
     twin.learn(10, reset_num_timesteps=False)
@@ -111,7 +111,7 @@ def test_environments_that_a_callback_has_set_are_reset(make_model: MakeModel, m
     np.testing.assert_array_equal(recorder.transitions[10][0], others.steps[0].observations)
 
 
-def test_what_a_callback_saves_goes_on_where_the_next_step_does(
+def test_a_model_saved_by_a_callback_continues_correctly(
     algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
 ) -> None:
     recorder = TransitionRecorder()
@@ -121,7 +121,7 @@ def test_what_a_callback_saves_goes_on_where_the_next_step_does(
     np.testing.assert_array_equal(loaded._last_obs, recorder.transitions[10][0])
 
 
-def test_a_place_that_a_callback_has_set_is_saved(
+def test_an_observation_set_by_a_callback_is_saved(
     algorithm: Algorithm, make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path
 ) -> None:
     def reset_and_save(model: Any) -> None:
@@ -137,7 +137,7 @@ def test_a_place_that_a_callback_has_set_is_saved(
 
 
 @pytest.mark.parametrize("stop", [False, KeyboardInterrupt])
-def test_training_goes_on_where_a_callback_ended_it(
+def test_training_continues_after_a_callback_stopped_it(
     make_model: MakeModel, make_venv: MakeVenv, stop: bool | type[BaseException]
 ) -> None:
     def end(local: dict[str, Any], _: dict[str, Any]) -> bool:
@@ -169,7 +169,7 @@ class Tick(BaseCallback):
 
 
 class CountOf(BaseCallback):
-    """Notes what lists have counted while it is told."""
+    """Records the counters of the lists when it is called."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -182,14 +182,14 @@ class CountOf(BaseCallback):
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_lists_of_callbacks_count_as_their_members_do(make_model: MakeModel, make_venv: MakeVenv, n_envs: int) -> None:
+def test_callback_lists_count_like_their_members(make_model: MakeModel, make_venv: MakeVenv, n_envs: int) -> None:
     inner_count, event_count = CountOf(), Tick()
     inner = CallbackList([inner_count])
     in_event = CallbackList([event_count])
     outer = CallbackList([inner, EveryNTimesteps(5 * n_envs, in_event), CallbackList([])])
     inner_count.lists = [outer, inner, outer.callbacks[2]]  # type: ignore[list-item]
     model = make_model(make_venv(n_envs)).learn(20 * n_envs, callback=outer)
-    # While the members are told, their lists have counted the step already.
+    # When the members are called, their lists have already counted the step.
     assert inner_count.noted == [[(step, step * n_envs)] * 3 for step in range(1, 21)]
     assert (in_event.n_calls, in_event.num_timesteps) == (event_count.n_calls, event_count.num_timesteps)
     assert (in_event.n_calls, in_event.num_timesteps) == (4, 20 * n_envs)
@@ -221,7 +221,7 @@ def test_lists_count_where_no_callback_is_called_at_every_step(
 
 
 class ReportingEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """Reports an episode at every third step, whether it ends or not, as lap counters do; and a success with it."""
+    """Reports an episode and a success at every third step, independent of episode ends."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -236,12 +236,12 @@ class ReportingEnv(gym.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
 
-def test_an_episode_that_is_reported_before_it_ends_counts(env_cls: Any, make_model: MakeModel) -> None:
+def test_an_episode_reported_before_its_end_counts(env_cls: Any, make_model: MakeModel) -> None:
     model = make_model(ReportingEnv(env_cls(lengths=[1000]))).learn(30)
     assert model.ep_info_buffer is not None
-    # Monitor, the outer wrapper that SB3 puts on, reports ends alone, of which there is none.
+    # SB3's outer Monitor reports only episode ends, and there is none.
     assert [info["r"] for info in model.ep_info_buffer] == [3.0 * lap for lap in range(1, 11)]
-    # A success counts when the episode is over, as in SB3.
+    # A success counts at the end of the episode, as in SB3.
     assert not model.ep_success_buffer
 
 
@@ -249,7 +249,7 @@ def test_an_episode_that_is_reported_before_it_ends_counts(env_cls: Any, make_mo
 
 
 class HParamCallback(BaseCallback):
-    """The one of SB3's documentation, word for word."""
+    """The callback of SB3's documentation, copied verbatim."""
 
     def _on_training_start(self) -> None:
         hparam_dict = {
@@ -288,7 +288,7 @@ def test_hyperparameters_are_logged_as_sb3_says(
 
 
 @pytest.mark.parametrize("name", ["learning_rate", "trace_decay"])
-def test_a_word_is_the_schedule_that_it_says(
+def test_a_string_gives_the_schedule(
     algorithm: Algorithm, make_model: MakeModel, name: str, tmp_path: pathlib.Path
 ) -> None:
     word, schedule = make_model(**{name: "lin_0.8_0.1"}), make_model(**{name: LinearSchedule(0.8, 0.1, 1.0)})
@@ -302,12 +302,12 @@ def test_a_word_is_the_schedule_that_it_says(
 
 @pytest.mark.parametrize("word", ["lin_", "lin_x", "lin_0.5_-0.1", "lin_0.5_0.1_0", "linear_0.5"])
 @pytest.mark.parametrize("name", ["learning_rate", "trace_decay"])
-def test_a_wrong_word_is_refused(make_model: MakeModel, name: str, word: str) -> None:
+def test_an_invalid_string_is_refused(make_model: MakeModel, name: str, word: str) -> None:
     with pytest.raises(ValueError, match=name):
         make_model(**{name: word})
 
 
-def test_temperature_as_a_word() -> None:
+def test_temperature_as_a_string() -> None:
     softmax: dict[str, Any] = {"exploration": "softmax", "points": (8, 6), "seed": 0}
     word = KNNTD(DriftEnv(), temperature="lin_2_0.1", **softmax).learn(200)
     schedule = KNNTD(DriftEnv(), temperature=LinearSchedule(2.0, 0.1, 1.0), **softmax).learn(200)

@@ -1,4 +1,4 @@
-"""What SB3's users count on of a model besides learning: how it is made, its policy, its files, its environments."""
+"""SB3's conventions for models: construction, policy, files and environments."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def message_of(make: Callable[[], Any]) -> str:
     return str(error.value)
 
 
-# -------------------------------------------------------------- how it is made
+# --------------------------------------------------------------- construction
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def message_of(make: Callable[[], Any]) -> str:
         (lambda: KNNTD(DummyVecEnv), ["class DummyVecEnv"]),
     ],
 )
-def test_a_wrong_call_says_what_the_right_one_is(make: Callable[[], Any], says: list[str]) -> None:
+def test_a_wrong_call_names_the_right_one(make: Callable[[], Any], says: list[str]) -> None:
     message = message_of(make)
     for words in says:
         assert words in message
@@ -67,7 +67,7 @@ def test_environments_of_gymnasium_vector(order: Callable[[Any], tuple[Any, ...]
     envs.close()
 
 
-def test_policies_of_ones_own_are_taken() -> None:
+def test_user_defined_policies_are_accepted() -> None:
     class Ours(KNNPolicy):
         pass
 
@@ -82,7 +82,7 @@ def test_policies_of_ones_own_are_taken() -> None:
 
 
 class Switches(gym.Env[Any, Any]):
-    """Lights that are to be all on; an action turns one over. Seen as bits, or as components of two states."""
+    """Switch all lights on; an action toggles one. Observed as bits, or as components with two states."""
 
     def __init__(self, n: int = 4, binary: bool = True) -> None:
         self.observation_space: Any = spaces.MultiBinary(n) if binary else spaces.MultiDiscrete([2] * n)
@@ -132,7 +132,7 @@ def test_switches_are_learned() -> None:
     model = KNNTD(Switches(), seed=0).learn(5_000)
     every = model.policy.points.numpy().astype(np.int8)[:-1]
     actions, _ = model.predict(every, deterministic=True)
-    # The best is to turn on one that is off.
+    # The best action switches on a light that is off.
     assert not every[np.arange(len(every)), actions].any()
 
 
@@ -141,7 +141,7 @@ def test_many_bits_have_a_row_for_each_state_that_was_visited() -> None:
     assert 10 < model.policy.q_table.shape[0] < 1_000
 
 
-def test_bits_of_several_axes_and_points_of_ones_own_are_refused() -> None:
+def test_bits_of_several_axes_and_given_points_are_refused() -> None:
     class Board(Switches):
         def __init__(self) -> None:
             super().__init__()
@@ -155,11 +155,11 @@ def test_bits_of_several_axes_and_points_of_ones_own_are_refused() -> None:
 
 
 class Mine(KNNTD):
-    """A subclass, as users have it."""
+    """A user-defined subclass."""
 
 
 class MineToo(ExA):
-    """Another."""
+    """Another user-defined subclass."""
 
 
 @pytest.mark.parametrize(("base", "sub", "other"), [(KNNTD, Mine, ExA), (ExA, MineToo, KNNTD)])
@@ -203,12 +203,12 @@ def test_the_table_as_a_vector_and_back(make_model: MakeModel, table: str, dtype
 
     wanted = np.random.default_rng(0).normal(size=len(vector)).astype(vector.dtype)
     model.policy.load_from_vector(wanted)
-    # The vector is a copy, there and back.
+    # The vector is a copy in both directions.
     wanted_then, vector_then = wanted.copy(), vector.copy()
     wanted[:] = np.nan
     np.testing.assert_array_equal(model.policy.parameters_to_vector(), wanted_then)
     np.testing.assert_array_equal(vector, vector_then)
-    # An episode goes on, and learns on top of what was loaded.
+    # The episode continues, and learns from the loaded values.
     model.learn(1, reset_num_timesteps=False)
     after = model.policy.parameters_to_vector()[: len(wanted_then)]
     changed = after != wanted_then
@@ -224,7 +224,7 @@ def test_a_vector_that_does_not_fit(make_model: MakeModel) -> None:
     np.testing.assert_array_equal(model.policy.parameters_to_vector(), before)
 
 
-def test_another_policy_is_refused_with_what_to_do(
+def test_a_replaced_policy_is_refused_with_advice(
     make_model: MakeModel, observations: np.ndarray, tmp_path: pathlib.Path
 ) -> None:
     teacher = make_model(seed=5).learn(400)
@@ -232,7 +232,7 @@ def test_another_policy_is_refused_with_what_to_do(
     other = type(teacher.policy).load(tmp_path / "policy")  # type: ignore[arg-type]
     model = make_model()
     made_with, model.policy = model.policy, other  # type: ignore[assignment]
-    # To ask it is what it can be replaced for.
+    # A replaced policy may be used for prediction.
     expected, _ = teacher.predict(observations, deterministic=True)
     np.testing.assert_array_equal(model.predict(observations, deterministic=True)[0], expected)
     with pytest.raises(ValueError, match=r"model\.policy\.load_state_dict\(other\.state_dict\(\)\)"):
@@ -248,7 +248,7 @@ def test_another_policy_is_refused_with_what_to_do(
 # ------------------------------------------------------------- normalised observations
 
 
-def test_an_environment_that_normalises_is_set_where_the_model_was_made_for_it(
+def test_a_normalising_environment_needs_a_model_made_for_it(
     make_model: MakeModel, make_venv: MakeVenv, algorithm: Algorithm, tmp_path: pathlib.Path
 ) -> None:
     model = make_model(make_venv()).learn(50)
@@ -267,7 +267,7 @@ def test_an_environment_that_normalises_is_set_where_the_model_was_made_for_it(
     algorithm.load(tmp_path / "model", env=make_venv()).learn(10)
 
 
-def test_a_model_of_normalised_observations_goes_on_with_them_alone(
+def test_a_model_of_normalised_observations_needs_them(
     make_model: MakeModel, make_venv: MakeVenv, algorithm: Algorithm, tmp_path: pathlib.Path
 ) -> None:
     venv = VecNormalize(make_venv())
@@ -286,7 +286,7 @@ def test_a_model_of_normalised_observations_goes_on_with_them_alone(
     assert loaded.get_vec_normalize_env() is again
     loaded.learn(50)
     assert algorithm.load(tmp_path / "model", env=again).learn(50).num_timesteps == 50
-    # A policy that is saved by itself stands where the model's does.
+    # A separately saved policy is equal to that of the model.
     loaded.policy.save(tmp_path / "policy")  # type: ignore[arg-type]
     policy = type(loaded.policy).load(tmp_path / "policy")  # type: ignore[arg-type]
     assert th.equal(policy.points, model.policy.points)

@@ -1,4 +1,4 @@
-"""No dearer for a million points than for three hundred: the hashed table, exact traces, memory, many environments."""
+"""Scaling: hashed tables, exact traces, memory, compilation and many environments."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from sb3_knntd.q_table import ActiveTraces, DenseTable, HashedTable
 
 
 class Walk(gym.Env[np.ndarray, int]):
-    """A random walk in a box: an action pushes one dimension, a wall stops it.
+    """A random walk in a box: the action pushes one dimension, walls stop it.
 
     :param n_dims: number of dimensions
-    :param length: steps of an episode
-    :param seed: of the moves; environments of different seeds go different ways
-    :param stride: how far a step goes
-    :param end: how an episode ends, "terminated" or "truncated"
+    :param length: steps per episode
+    :param seed: seed of the moves; environments with different seeds differ
+    :param stride: size of a step
+    :param end: how episodes end, "terminated" or "truncated"
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Walk(gym.Env[np.ndarray, int]):
 
 
 def walks(n_envs: int = 1, **arguments: Any) -> VecEnv:
-    """Environments that go different ways, and out of step."""
+    """Environments with different dynamics and episode lengths."""
     length, first_seed = arguments.pop("length", 40), arguments.pop("seed", 0)
 
     def make(number: int) -> Callable[[], gym.Env[Any, Any]]:
@@ -82,7 +82,7 @@ def walks(n_envs: int = 1, **arguments: Any) -> VecEnv:
 
 
 def make_model(env: Any, table: str = "auto", dtype: th.dtype = th.float64, **arguments: Any) -> KNNTD:
-    """A model that leaves nothing that matters here to a default."""
+    """A model without default values for the relevant arguments."""
     policy_kwargs: dict[str, Any] = {"table": table, "dtype": dtype, "compiled": arguments.pop("compiled", True)}
     chosen: dict[str, Any] = {
         "points": (20, 15),
@@ -100,7 +100,7 @@ def make_model(env: Any, table: str = "auto", dtype: th.dtype = th.float64, **ar
 
 
 def as_dense(model: KNNTD) -> np.ndarray:
-    """The table with all of its points, whichever way it is kept."""
+    """The values of all points of a dense or hashed table."""
     table = model.policy.table
     n_points = model.policy.perceiver.points.n_points
     rows: np.ndarray = table.rows(th.arange(n_points)[:, None])[:, 0].numpy()
@@ -154,13 +154,13 @@ def test_hashed_learns_what_dense_does_on_discrete_states() -> None:
     np.testing.assert_array_equal(as_dense(hashed), as_dense(dense))
     rows, values = hashed.policy.table.points(), hashed.policy.q_table
     assert rows is not None
-    # The place of a state is the state.
+    # The index of a state is the state.
     np.testing.assert_array_equal(hashed.policy.points.numpy().round(9), rows.numpy()[:, None])
     assert th.equal(dense.policy.q_table[rows], values)
 
 
 class VisitedPoints(BaseCallback):
-    """The points of the states that were learned from so far, by a perceiver of its own."""
+    """The points updated so far, computed by a separate perceiver."""
 
     def __init__(self, perceiver: NearestPoints) -> None:
         super().__init__()
@@ -174,7 +174,7 @@ class VisitedPoints(BaseCallback):
     def _on_step(self) -> bool:
         assert isinstance(self.model, KNNTD)
         self.n_rows.append((len(self.points), self.model.policy.q_table.shape[0]))
-        # What is seen now is learned at in the next step.
+        # The current observation is updated in the next step.
         self._add(self.locals["new_obs"])
         return True
 
@@ -184,13 +184,13 @@ class VisitedPoints(BaseCallback):
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_rows_are_made_when_first_learned_at(n_envs: int) -> None:
+def test_rows_are_created_at_the_first_update(n_envs: int) -> None:
     low, high = np.array([-2.0, -1.0]), np.array([1.0, 3.0])
     model = make_model(walks(n_envs), "hashed", bounds=(low, high), points=(9, 7))
     perceiver = NearestPoints((9, 7), (low, high), 4)
     assert model.policy.q_table.shape == (0, 3)
     assert model.policy.points.shape == (0, 2)
-    # To be asked about a point is not to learn at it.
+    # Reading the values of a point does not create a row.
     model.predict(np.zeros((5, 2), np.float32), deterministic=True)
     assert model.policy.q_table.shape == (0, 3)
 
@@ -206,7 +206,7 @@ def test_rows_are_made_when_first_learned_at(n_envs: int) -> None:
     places = low + 0.5 * (perceiver.points[rows] + 1.0) * (high - low)
     np.testing.assert_allclose(model.policy.points.numpy(), places, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(model.policy.q_table.numpy(), as_dense(model)[rows])
-    # All of the others are worth the initial value.
+    # All other points have the initial value.
     assert not np.delete(as_dense(model), rows, axis=0).any()
 
 
@@ -224,7 +224,7 @@ def test_growth_keeps_everything(n_envs: int) -> None:
 
 
 @pytest.mark.parametrize("first", [7, 501, 2_003])
-def test_hashed_goes_on_from_a_file(tmp_path: pathlib.Path, first: int) -> None:
+def test_a_hashed_table_continues_from_a_file(tmp_path: pathlib.Path, first: int) -> None:
     arguments: dict[str, Any] = {"points": (200, 200), "n_neighbors": 6, "table": "hashed"}
     whole = make_model(walks(stride=0.15), **arguments).learn(first)
     whole.learn(3_000 - first, reset_num_timesteps=False)
@@ -249,14 +249,14 @@ def test_a_smaller_table_is_loaded_into_a_larger_one() -> None:
     late.set_parameters(early.get_parameters())
     np.testing.assert_array_equal(as_dense(late), as_dense(early))
     assert th.equal(late.policy.points, early.policy.points)
-    # The rows that are made from now on know nothing of those that were there before.
+    # New rows are not affected by the previous ones.
     before = set(early.policy.table.points().tolist())  # type: ignore[union-attr]
     visited = VisitedPoints(NearestPoints((200, 200), (-np.ones(2), np.ones(2)), 4))
     late.learn(300, callback=visited)
     rows = late.policy.table.points()
     assert rows is not None
     assert len(set(rows.tolist())) == len(rows) > len(before) + 100
-    # What was seen last has not been learned at.
+    # The last observation has not been updated.
     assert len(visited.points - set(rows.tolist())) <= 4
     assert set(rows.tolist()) <= visited.points | before
 
@@ -288,7 +288,7 @@ def test_a_lattice_of_a_trillion_points_learns() -> None:
     assert rows is not None
     digits = np.array([[int(digit) for digit in f"{row:012d}"] for row in rows.tolist()])
     np.testing.assert_allclose(model.policy.points.numpy(), -1.0 + 2.0 * digits / 9, atol=1e-12)
-    # It has learned, and what it shows is what it acts by.
+    # It has learned, and the shown values are those it acts on.
     assert model.policy.q_table.numpy().any(axis=1).mean() > 0.9
     places = model.policy.points[:50].numpy()
     expected = [model.policy.q_table.numpy()[i] for i in range(50)]
@@ -297,7 +297,7 @@ def test_a_lattice_of_a_trillion_points_learns() -> None:
     np.testing.assert_array_equal(model.policy.table.rows(perception.indices)[:, 0].numpy(), expected)
 
 
-def test_auto_takes_the_table_that_fits() -> None:
+def test_auto_selects_the_suitable_table() -> None:
     assert isinstance(make_model(walks(), points=(1000, 1000)).policy.table, DenseTable)
     assert isinstance(make_model(walks(), points=(10_000, 10_000)).policy.table, HashedTable)
 
@@ -308,13 +308,13 @@ def test_auto_takes_the_table_that_fits() -> None:
 EPISODES: dict[str, dict[str, Any]] = {
     "one long episode": {"gamma": 1.0, "trace_decay": 0.99},
     "traces that never fade": {"gamma": 1.0, "trace_decay": 1.0},
-    # γ λ = 0.891: the clock falls to 1e-4 and begins anew every 80 steps.
+    # γ λ = 0.891: the decay product reaches 1e-4 and is reset every 80 steps.
     "many restarts of the clock": {"gamma": 0.99, "trace_decay": 0.9},
 }
 
 
 def against_torch(n_steps: int, env: Callable[[], VecEnv], **arguments: Any) -> KNNTD:
-    """A compiled run, after it was found equal to that of the torch operations; no trace is ever let go there."""
+    """A compiled run that was checked against the torch operations, which never drop a trace."""
     compiled, torch = (make_model(env(), compiled=flag, **arguments).learn(n_steps) for flag in (True, False))
     assert isinstance(compiled.learner, CompiledLearner)
     assert isinstance(torch.learner, TorchLearner)
@@ -327,7 +327,7 @@ def against_torch(n_steps: int, env: Callable[[], VecEnv], **arguments: Any) -> 
 @pytest.mark.parametrize("traces", ["replacing", "accumulating"])
 @pytest.mark.parametrize("episode", EPISODES.values(), ids=EPISODES)
 def test_long_episodes(episode: dict[str, Any], traces: str) -> None:
-    # A trace that is added to for thousands of steps is large: the step must be small, or the values diverge.
+    # A trace that accumulates for thousands of steps is large: the step size must be small, or the values diverge.
     learning_rate = 0.02 if traces == "replacing" else 1e-5 if episode["trace_decay"] == 1.0 else 1e-3
     n_steps = 5_000 if traces == "replacing" else 2_000
     against_torch(n_steps, lambda: walks(length=10**9), traces=traces, learning_rate=learning_rate, **episode)
@@ -337,7 +337,7 @@ def test_long_episodes(episode: dict[str, Any], traces: str) -> None:
 @pytest.mark.parametrize("end", ["terminated", "truncated"])
 @pytest.mark.parametrize("gamma", [1.0, 0.95])
 def test_traces_of_many_environments(end: str, traces: str, gamma: float) -> None:
-    # Out of step: an episode's end must take that environment's traces and no other's.
+    # Different episode lengths: the end of an episode must clear only the traces of that environment.
     against_torch(
         16 * 250,
         lambda: walks(16, length=20, end=end),
@@ -350,7 +350,7 @@ def test_traces_of_many_environments(end: str, traces: str, gamma: float) -> Non
 
 
 class Alive(BaseCallback):
-    """How many points have a trace, and for how many there is room."""
+    """The number of points with a trace, and the capacity."""
 
     def _init_callback(self) -> None:
         self.alive: list[int] = []
@@ -378,12 +378,13 @@ def test_only_points_with_a_trace_are_kept(n_envs: int, length: int, gamma: floa
         walks(n_envs, length=length, stride=0.2), points=(300, 300), gamma=gamma, trace_decay=trace_decay
     )
     model.learn(6_000 if n_envs < 64 else 12_800, callback=watch)
-    # Many more have been visited than there are traces at any time.
+    # Many more points have been visited than have a trace at any time.
     assert model.policy.table.n_visited > 3 * max(watch.alive)
     if n_envs == 1:
-        # Episodes end with all of their traces, and a fading trace is let go before the third restart of the clock.
+        # The end of an episode clears all its traces, and a decayed trace is dropped before the third reset of the
+        # decay product.
         assert max(watch.held) <= 2 * max(watch.alive)
-    # Dead points are cleared out when there is no more room, and room is made for twice those alive.
+    # If the capacity is used up, inactive points are removed, and the capacity becomes twice the number of active ones.
     per_step = 4 * n_envs
     assert max(watch.room) <= max(1024, 4 * max(watch.alive) + 4 * per_step)
     half = len(watch.room) // 2
@@ -393,7 +394,7 @@ def test_only_points_with_a_trace_are_kept(n_envs: int, length: int, gamma: floa
 @pytest.mark.parametrize("n_envs", [1, 4])
 @pytest.mark.parametrize("dtype", [th.float64, th.float32])
 @pytest.mark.parametrize("table", ["dense", "hashed"])
-def test_reading_is_not_touching(n_envs: int, dtype: th.dtype, table: str) -> None:
+def test_reading_does_not_change_the_table(n_envs: int, dtype: th.dtype, table: str) -> None:
     def reader(local: dict[str, Any], _: dict[str, Any]) -> bool:
         policy = local["self"].policy
         policy.q_table.sum()
@@ -409,7 +410,7 @@ def test_reading_is_not_touching(n_envs: int, dtype: th.dtype, table: str) -> No
 
 
 class Tables(BaseCallback):
-    """The table as it is shown at some steps, by every way of looking at it."""
+    """The table at some steps, read in every possible way."""
 
     def __init__(self, at: list[int]) -> None:
         super().__init__()
@@ -444,7 +445,7 @@ def test_the_table_in_the_middle_of_an_episode(n_envs: int, table: str) -> None:
 @pytest.mark.parametrize("n_envs", [1, 4])
 @pytest.mark.parametrize("table", ["dense", "hashed"])
 def test_parameters_in_the_middle_of_an_episode(n_envs: int, table: str) -> None:
-    # Taken out, other things learned meanwhile, put back: the traces of then go on with the table of then.
+    # Get the parameters, learn on, set them again: the old traces continue with the old table.
     arguments: dict[str, Any] = {"gamma": 1.0, "trace_decay": 0.97, "learning_rate": 0.02, "table": table}
     venv = walks(n_envs, length=150)
     model = make_model(venv, **arguments).learn(77 * n_envs)
@@ -465,7 +466,7 @@ def test_parameters_in_the_middle_of_an_episode(n_envs: int, table: str) -> None
 
 
 class Replace(BaseCallback):
-    """Gives the model other parameters at one step, while an episode goes on."""
+    """Sets other parameters of the model at one step, in the middle of an episode."""
 
     def __init__(self, at: int, parameters: Any) -> None:
         super().__init__()
@@ -481,14 +482,14 @@ class Replace(BaseCallback):
 
 @pytest.mark.parametrize("table", ["dense", "hashed"])
 def test_another_table_in_the_middle_of_learning(table: str) -> None:
-    # The learner must leave the arrays that it had at hand: what it learns afterwards goes into the new table.
+    # The learner must release its arrays: later updates go to the new table.
     other = make_model(walks(seed=9), table, initial_value=50.0).learn(200)
     given = {"policy": copy.deepcopy(other.get_parameters()["policy"])}
     model = make_model(walks(length=1_000), table, initial_value=50.0)
     replace = Replace(70, given)
     model.learn(71, callback=replace)
     np.testing.assert_array_equal(replace.after, as_dense(other))
-    # One step more has changed the four points of one state, and no others.
+    # One more step has changed the four points of one state, and no others.
     changed = (as_dense(model) != replace.after).any(axis=1)
     assert changed.sum() == 4
 
@@ -505,8 +506,8 @@ def test_memory_of_a_dense_table_and_its_traces(dtype: th.dtype, n_actions: int)
     assert sizes(model) <= 1.1 * 10**6 * n_actions * dtype.itemsize
 
 
-def test_sizes_counts_all_there_is() -> None:
-    # What holds the memory is named in `sizes` one by one: nothing else in the model may grow with the points.
+def test_sizes_are_complete() -> None:
+    # `sizes` lists everything that uses memory: nothing else in the model may grow with the points.
     model = make_model(walks(), points=(1000, 1000)).learn(1_000)
     known = sizes(model)
     found: dict[int, int] = {}
@@ -527,7 +528,7 @@ def test_sizes_counts_all_there_is() -> None:
 
 def test_single_precision_is_close() -> None:
     arguments: dict[str, Any] = {"gamma": 0.97, "trace_decay": 0.9, "target": "q_learning"}
-    # The same steps for both: who explores always does not act on a value that rounding has moved.
+    # The same steps for both: with ε = 1 rounding of the values does not affect the actions.
     arguments |= {"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0}
     for table in ("dense", "hashed"):
         single, double = (
@@ -551,7 +552,7 @@ def dispatchers() -> Iterator[tuple[str, Any]]:
         yield f"learn_at {number}", td._learn_at(kind)
 
 
-def test_kernels_are_cached_and_release_the_lock() -> None:
+def test_kernels_are_cached_and_release_the_gil() -> None:
     kernels = dict(dispatchers())
     assert {"learn", "begin", "recommend", "write_back", "flush", "nearest_on_lattice"} <= set(kernels)
     for name, kernel in kernels.items():
@@ -583,7 +584,7 @@ def test_other_threads_run_while_a_kernel_does(monkeypatch: pytest.MonkeyPatch) 
     other = threading.Thread(target=tick)
     interval = sys.getswitchinterval()
     try:
-        # No thread is made to let go of the lock: the other one has it only if this one gives it away.
+        # No forced thread switches: the other thread gets the GIL only if this one releases it.
         sys.setswitchinterval(1e3)
         other.start()
         begun.set()
@@ -598,8 +599,8 @@ def test_other_threads_run_while_a_kernel_does(monkeypatch: pytest.MonkeyPatch) 
     assert after > before
 
 
-# Everything that learning may come across: growth of table and traces, ends of both kinds, reading, files, a second
-# model. After the first step there must be nothing left to compile.
+# Everything that may happen during training: growth of table and traces, both kinds of episode ends, reading, files,
+# a second model. After the first step there must be nothing left to compile.
 IN_A_NEW_PROCESS = """
 import io, json, sys
 from test_scale import dispatchers, make_model, walks
@@ -635,7 +636,7 @@ print(json.dumps({"first": first_of, "last": last_of, "hits": hits}))
 
 
 def in_a_new_process(**environment: str) -> dict[str, Any]:
-    """What a process reports of its compilation."""
+    """The report of a process about its compilation."""
     run = subprocess.run(
         [sys.executable, "-c", IN_A_NEW_PROCESS],
         cwd=pathlib.Path(__file__).parent,
@@ -650,7 +651,7 @@ def in_a_new_process(**environment: str) -> dict[str, Any]:
 
 
 def test_kernels_are_compiled_once_for_all_processes() -> None:
-    # If this is the first time at all that they are used, the first process pays for it.
+    # If the kernels were never used before, the first process compiles them.
     report = in_a_new_process()
     if any(misses for _, misses in report["last"]["tree"].values()):
         report = in_a_new_process()
@@ -661,7 +662,7 @@ def test_kernels_are_compiled_once_for_all_processes() -> None:
 
 @pytest.mark.slow
 def test_nothing_is_compiled_after_the_first_step(tmp_path: pathlib.Path) -> None:
-    # With nothing on disk yet, so that whatever is compiled later than in the first step is seen to be.
+    # With an empty cache, so that everything compiled after the first step is detected.
     report = in_a_new_process(NUMBA_CACHE_DIR=str(tmp_path))
     assert report["first"]["one"]["learn"] == [1, 1]
     for run, first in report["first"].items():

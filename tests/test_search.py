@@ -1,4 +1,4 @@
-"""Every search gives the answer of the torch reference: the same points in the same order, the same distances."""
+"""Every search agrees with the torch reference: the same points in the same order, and the same distances."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def unit_bounds(n_dims: int) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds that make observation units scaled units."""
+    """Bounds with which observation units equal scaled units."""
     return -np.ones(n_dims), np.ones(n_dims)
 
 
@@ -44,7 +44,7 @@ def query(name: str, points: Points, k: int, scaled: np.ndarray) -> Neighbors:
 
 
 def assert_same(got: Neighbors, expected: Neighbors) -> None:
-    """Exactly, with no tolerance at all."""
+    """Compare exactly, without tolerance."""
     assert got.indices.dtype == th.int64
     assert got.squared_distances.dtype == th.float64
     np.testing.assert_array_equal(got.indices.numpy(), expected.indices.numpy())
@@ -61,7 +61,7 @@ def compiled_brute(points: Points, k: int, scaled: np.ndarray) -> Neighbors:
 
 
 def by_hand(places: np.ndarray, k: int, scaled: np.ndarray) -> Neighbors:
-    """All distances, sorted by (distance, index), in NumPy alone."""
+    """All distances, sorted by (distance, index), in plain NumPy."""
     squared = np.array([squared_distances(x, places) for x in scaled])
     indices = np.array([np.lexsort((np.arange(len(places)), row))[:k] for row in squared])
     return Neighbors(th.from_numpy(indices), th.from_numpy(np.take_along_axis(squared, indices, axis=1)))
@@ -71,13 +71,13 @@ def by_hand(places: np.ndarray, k: int, scaled: np.ndarray) -> Neighbors:
 
 
 def places_of_interest(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Observations anywhere, on points, at the middle of cells, on faces, and far outside, in scaled units."""
+    """Random observations, and observations on points, cell centres, faces, and far outside, in scaled units."""
     axes = Lattice(shape).axes
     d = len(shape)
     on_points = np.stack([rng.choice(axis, 6) for axis in axes], axis=1)
     centres = np.stack([rng.choice((axis[:-1] + axis[1:]) / 2 if len(axis) > 1 else axis, 6) for axis in axes], axis=1)
     anywhere = rng.uniform(-1.3, 1.3, (6, d))
-    # A face between two cells, or of the whole lattice: one coordinate is a point's, the others are not.
+    # A face between two cells or of the whole lattice: one coordinate is that of a point.
     faces = rng.uniform(-1.0, 1.0, (6, d))
     faces[np.arange(6), rng.integers(0, d, 6)] = on_points[np.arange(6), rng.integers(0, d, 6)]
     far = rng.choice([-1e4, 1e4, 0.0, 37.5], (6, d))
@@ -106,7 +106,7 @@ def test_lattice(case: tuple[tuple[int, ...], int], seed: int) -> None:
     assert_same(query("lattice", points, k, scaled), expected)
     assert_same(query("kd_tree", points, k, scaled), expected)
     assert_same(compiled_brute(points, k, scaled), expected)
-    # The reference itself is held to a few lines of NumPy.
+    # The reference is checked against a few lines of NumPy.
     assert_same(by_hand(lattice(shape) if 1 not in shape else coordinates(points), k, scaled), expected)
 
 
@@ -130,7 +130,7 @@ def test_very_many_neighbours(shape: tuple[int, ...], k: int) -> None:
 
 @pytest.mark.parametrize("search", ["lattice", "kd_tree"])
 def test_distances_that_rounding_makes_equal(search: str) -> None:
-    # So far outside that the points' differences are lost in the sum, whole planes of them tie.
+    # Far outside, differences between points are lost to rounding, and whole planes of points tie.
     points = Lattice((5, 50))
     scaled = np.array([[1e4, 0.3], [1e4, -1e4], [0.1, 1e4], [1e4, 1e-13], [-9876.5, 0.5 / 49]])
     expected = query("brute", points, 60, scaled)
@@ -141,8 +141,8 @@ def test_distances_that_rounding_makes_equal(search: str) -> None:
 @given(seed=SEEDS, k=st.integers(1, 30))
 @settings(PROPERTY, max_examples=12)
 def test_trillions_of_points_in_twelve_dimensions(seed: int, k: int) -> None:
-    # Of every dimension the three nearest coordinates: that is where the nearest points are, and half a million
-    # combinations can all be looked at.
+    # The nearest points are among the three nearest coordinates of every dimension, and half a million
+    # combinations can be enumerated.
     rng = np.random.default_rng(seed)
     points = Lattice((10,) * 12)
     assert points.n_points == 10**12
@@ -158,7 +158,7 @@ def test_trillions_of_points_in_twelve_dimensions(seed: int, k: int) -> None:
         numbers = (numbers[:, None] * 10 + coordinates[dimension]).ravel()
     nearest = np.lexsort((numbers, totals))[:k]
 
-    # What was left out is farther: the best of it has one coordinate of rank three and all others of rank none.
+    # The excluded points are farther: the nearest of them has one coordinate of rank three and all others of rank zero.
     ranked = np.sort((x[:, None] - axis) ** 2, axis=1)
     left_out = ranked[:, 0].sum() + (ranked[:, 3] - ranked[:, 0]).min()
     assert totals[nearest[-1]] < left_out * (1 - 1e-12)
@@ -169,7 +169,7 @@ def test_trillions_of_points_in_twelve_dimensions(seed: int, k: int) -> None:
 
 
 def test_equal_distances_in_many_dimensions() -> None:
-    # The middle of a cell has 2^12 points at one distance; those of the lowest indices are wanted.
+    # The centre of a cell has 2^12 points at the same distance; those with the lowest indices must be found.
     (indices,), (distances,) = query("lattice", Lattice((10,) * 12), 25, np.zeros((1, 12)))
     lowest = sorted(int("".join(digits)) for digits in itertools.product("45", repeat=12))[:25]
     np.testing.assert_array_equal(indices.numpy(), lowest)
@@ -189,21 +189,21 @@ assert indices.tolist() == [0, 1, 2, 3, 4], indices
 
 def test_the_middle_of_a_lattice_of_many_dimensions() -> None:
     # An observation of zeros, at which many environments begin, is as far from each of 2^40 points: "auto" gives
-    # such a lattice to 40 dimensions. Only k of these may be looked at, for all of them fit in no memory.
+    # such a lattice to 40 dimensions. The search must not enumerate them, because they do not fit into memory.
     run = subprocess.run([sys.executable, "-c", IN_THE_MIDDLE], capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stderr[-500:]
 
 
 @pytest.mark.parametrize(("n_dims", "points"), [(15, 20), (63, 2), (70, "auto")])
 def test_more_points_than_an_index_can_number(n_dims: int, points: Any) -> None:
-    # From 2^63 points on an int64 runs over, and different points would share an entry of the table. What cannot
-    # be numbered has to be refused, in words that say what to change.
+    # From 2^63 points on an int64 overflows, and different points would share an entry of the table. Such
+    # lattices must be refused with a message that says what to change.
     with pytest.raises(ValueError, match="points"):
         KNNTD(StillEnv(n_dims), points=points, bounds=unit_bounds(n_dims))
 
 
 def test_a_lattice_larger_than_memory_is_not_made() -> None:
-    # Nobody has 8 TB for an array of this many bytes, let alone of the points: it is enough that this runs.
+    # The points would need more than 8 TB of memory: it is enough that this runs.
     model = KNNTD(StillEnv(12), points=10, n_neighbors=25, bounds=unit_bounds(12))
     assert model.policy.perceiver.points.n_points == 10**12
     assert model.policy.search_name == "lattice"
@@ -243,7 +243,7 @@ def test_kd_tree(seed: int, n_dims: int, n_points: int, data: st.DataObject) -> 
     if kind == "duplicated":
         places = places[rng.integers(0, 1 + n_points // 4, n_points)]
     elif kind == "grid":
-        # Quarters are exact in binary, so that distances which look equal are.
+        # Quarters are exact in binary, so that equal distances are exactly equal.
         places = rng.integers(-4, 5, (n_points, n_dims)) / 4
     elif kind == "one place":
         places = np.tile(places[:1], (n_points, 1))
@@ -285,7 +285,7 @@ def test_points_that_are_added(seed: int, n_dims: int, sizes: list[int], data: s
 
 @pytest.mark.parametrize("n_dims", [1, 3])
 def test_kd_tree_where_distances_differ_by_rounding_alone(n_dims: int) -> None:
-    # Thirds are not exact: the tree, which measures by its own arithmetic, may order such points otherwise.
+    # Thirds are not exact: the tree's arithmetic may order such points differently.
     shape = (13,) * n_dims
     points = Scattered(lattice(shape)[np.random.default_rng(0).permutation(13**n_dims)])
     scaled = places_of_interest(np.random.default_rng(3), shape)
@@ -293,8 +293,8 @@ def test_kd_tree_where_distances_differ_by_rounding_alone(n_dims: int) -> None:
         assert_same(query("kd_tree", points, k, scaled), query("brute", points, k, scaled))
 
 
-def test_many_rows_are_answered_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    # More distances than are held at once: the rows must come back in their order.
+def test_many_rows_are_processed_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    # More distances than are computed at once: the rows must be returned in order.
     monkeypatch.setattr("sb3_knntd.perception.search.brute.MAX_DISTANCES", 7 * 500 + 3)
     points = Scattered(np.random.default_rng(4).uniform(-1.0, 1.0, (500, 2)))
     scaled = np.random.default_rng(5).uniform(-1.0, 1.0, (200, 2))
@@ -306,7 +306,7 @@ def test_many_rows_are_answered_in_turns(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.fixture(scope="module")
 def scattered() -> tuple[Scattered, np.ndarray]:
-    """20,000 points in six dimensions, and a thousand places to ask about."""
+    """20,000 points in six dimensions, and a thousand observations."""
     rng = np.random.default_rng(6)
     return Scattered(rng.uniform(-1.0, 1.0, (20_000, 6))), rng.uniform(-1.0, 1.0, (1_000, 6))
 
@@ -317,7 +317,7 @@ def test_hnsw_finds_nearly_all(scattered: tuple[Scattered, np.ndarray]) -> None:
     found, true = query("hnsw", points, 16, scaled), query("kd_tree", points, 16, scaled)
     shared = [len(set(a) & set(b)) for a, b in zip(found.indices.tolist(), true.indices.tolist(), strict=True)]
     assert sum(shared) / true.indices.numel() >= 0.99
-    # What it did find, it orders and measures like all others.
+    # The order and distances of the found points are those of the other searches.
     exact = (found.indices == true.indices).all(dim=1)
     assert exact.float().mean() > 0.9
     assert th.equal(found.squared_distances[exact], true.squared_distances[exact])
@@ -328,7 +328,7 @@ def test_hnsw_is_the_same_every_time(scattered: tuple[Scattered, np.ndarray]) ->
     points, scaled = Scattered(scattered[0].places[:5_000].numpy()), scattered[1]
     first = query("hnsw", points, 16, scaled)
     assert_same(query("hnsw", points, 16, scaled), first)
-    # One by one or together is the same, too.
+    # Single observations and batches give the same result.
     search = fitted("hnsw", points, 16)
     alone = [search.query(th.from_numpy(row[None])) for row in scaled[:50]]
     np.testing.assert_array_equal(np.concatenate([part.indices for part in alone]), first.indices[:50])
@@ -342,8 +342,8 @@ def test_hnsw_with_few_points() -> None:
         assert_same(query("hnsw", points, k, scaled), query("brute", points, k, scaled))
 
 
-def test_hnsw_learns_as_an_exact_search_does() -> None:
-    # With so few points it misses none, so that the whole run is the same.
+def test_hnsw_learns_like_an_exact_search() -> None:
+    # With so few points it misses none, so the whole run is the same.
     pytest.importorskip("voyager")
     points = np.random.default_rng(9).uniform([-1.2, -0.07], [0.6, 0.07], (200, 2))
     hnsw, exact = (

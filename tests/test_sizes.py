@@ -1,4 +1,4 @@
-"""What would take the machine's memory is refused before it is begun, with how much it would take."""
+"""Settings that need too much memory are refused before allocation, with the required size."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sb3_knntd.filters import DeltaFilter
 
 
 class Still(gym.Env[Any, Any]):
-    """Nothing happens, in any spaces."""
+    """An environment with given spaces that is never stepped."""
 
     def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         self.observation_space, self.action_space = observation_space, action_space
@@ -58,7 +58,7 @@ PLANE, TWO = box(2), spaces.Discrete(2)
         (lambda: DeltaFilter(Still(PLANE, box(1)), action_points=10**18), "action_points", "20.82 EiB"),
     ],
 )
-def test_what_would_fill_the_memory_is_refused(make: Callable[[], Any], named: str, size: str) -> None:
+def test_too_large_settings_are_refused(make: Callable[[], Any], named: str, size: str) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(ValueError, match="more than 4 GiB") as error:
@@ -81,12 +81,12 @@ def test_what_would_fill_the_memory_is_refused(make: Callable[[], Any], named: s
     ],
     ids=["10^12 points", "10^16 states", "10^6 states", "1000 actions"],
 )
-def test_large_lattices_of_which_little_is_kept_are_taken(env: gym.Env[Any, Any], arguments: dict[str, Any]) -> None:
+def test_large_lattices_with_hashed_tables_are_accepted(env: gym.Env[Any, Any], arguments: dict[str, Any]) -> None:
     model = KNNTD(env, seed=0, **arguments).learn(10)
     assert model.policy.table.n_visited >= 1
 
 
-def test_sizes_are_told_in_units_that_are_read_easily() -> None:
+def test_sizes_are_printed_in_readable_units() -> None:
     assert [in_bytes(n) for n in (0, 1000, 2**10, 3 * 2**29, 10**20, 10**400)] == [
         "0 bytes", "1,000 bytes", "1 KiB", "1.5 GiB", "86.74 EiB", "1.00e+400 bytes",
     ]  # fmt: skip

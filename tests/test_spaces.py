@@ -1,4 +1,4 @@
-"""Which spaces are taken, what becomes of them, and what is said of the others."""
+"""Supported spaces, their points, and the errors for unsupported ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sb3_knntd import KNNTD
 
 
 class SpaceEnv(gym.Env[Any, Any]):
-    """Observations drawn from a space, whatever is done; a reward of 1, episodes of ten steps."""
+    """Random observations from a space, a reward of 1, and episodes of ten steps."""
 
     def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any] | None = None) -> None:
         self.observation_space = observation_space
@@ -58,12 +58,12 @@ def test_boxes_of_any_number_type(dtype: str, obs_dim: int) -> None:
     assert (points.min(), points.max()) == (0.0, 100.0)
     observation = env.observation_space.sample()
     assert env.action_space.contains(model.predict(observation, deterministic=True)[0])
-    # The type holds the same place in other types.
+    # The same observation in other dtypes.
     as_float = np.asarray(observation, dtype=np.float64)
     assert th.equal(model.policy.q_values(observation), model.policy.q_values(as_float))
 
 
-def test_number_type_decides_nothing() -> None:
+def test_the_dtype_does_not_matter() -> None:
     tables = []
     for dtype in (np.uint8, np.int64, np.float32, np.float64):
         env = gym.wrappers.TransformObservation(
@@ -77,7 +77,7 @@ def test_number_type_decides_nothing() -> None:
 
 
 def test_small_numbers_do_not_overflow() -> None:
-    # In int8 itself 127 - -128 is -1.
+    # In int8 arithmetic 127 - -128 is -1.
     model = KNNTD(SpaceEnv(box([-128, -128], [127, 127], np.int8)), points=3, n_neighbors=1, seed=0)
     assert model.policy.perceive(np.array([-128, 127], dtype=np.int8)).indices.tolist() == [[2]]
     assert model.policy.perceive(np.array([127, -128], dtype=np.int8)).indices.tolist() == [[6]]
@@ -139,7 +139,7 @@ def test_exact_tables_predict(space: spaces.Space[Any], states: list[Any]) -> No
 
 
 @pytest.mark.parametrize("arguments", [{"n_neighbors": 1}, {"points": "auto"}, {"bounds": None}])
-def test_exact_tables_take_what_says_the_same(arguments: dict[str, Any]) -> None:
+def test_finite_states_accept_equivalent_arguments(arguments: dict[str, Any]) -> None:
     assert KNNTD(SpaceEnv(spaces.Discrete(5)), **arguments).policy.q_table.shape == (5, 2)
 
 
@@ -149,7 +149,7 @@ def test_exact_tables_take_what_says_the_same(arguments: dict[str, Any]) -> None
     ids=["Discrete", "MultiDiscrete", "MultiBinary"],
 )
 @pytest.mark.parametrize("arguments", [{"n_neighbors": 2}, {"points": 4}, {"bounds": ([0], [1])}])
-def test_exact_tables_have_nothing_to_choose(space: spaces.Space[Any], arguments: dict[str, Any]) -> None:
+def test_finite_states_refuse_perception_arguments(space: spaces.Space[Any], arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(arguments))):
         KNNTD(SpaceEnv(space), **arguments)
 
@@ -209,7 +209,7 @@ def test_spaces_of_a_vec_env_are_checked_too() -> None:
 
 
 class Wave(gym.Env[Any, Any]):
-    """Swings in [-3, 5] in one dimension and in [0, 1] in another; a reward of 1."""
+    """Oscillates in [-3, 5] in one dimension and in [0, 1] in another, with a reward of 1."""
 
     def __init__(self, low: Any, high: Any, dtype: Any = np.float64) -> None:
         self.observation_space = box(low, high, dtype)
@@ -250,15 +250,15 @@ def test_only_dimensions_without_a_range_are_measured(low: Any, high: Any, dtype
     model = KNNTD(Wave(low, high, dtype), points=5, n_neighbors=4, seed=0)
     model.learn(1100)
     lowest, highest = range_of(model)
-    # What was seen is inside, without wasting points on what was not.
+    # The observed range is inside, and not much more.
     assert -7.0 <= lowest[0] <= -3.0 + (dtype is np.int64)
     assert 5.0 - (dtype is np.int64) <= highest[0] <= 9.0
-    # The other dimension keeps the range it has.
+    # The other dimension keeps its range.
     assert (lowest[1], highest[1]) == (0.0, 1.0)
     assert model.policy.q_table.any()
 
 
-def test_steps_of_measuring_count_and_teach_nothing() -> None:
+def test_measuring_steps_count_but_are_not_learned_from() -> None:
     model = KNNTD(Wave([-np.inf, 0.0], [np.inf, 1.0]), points=5, n_neighbors=4, seed=0)
     model.learn(500)
     assert model.num_timesteps == 500
@@ -271,7 +271,7 @@ def test_steps_of_measuring_count_and_teach_nothing() -> None:
 def test_range_is_measured_once() -> None:
     model = KNNTD(Wave([-np.inf, 0.0], [np.inf, 1.0]), points=5, n_neighbors=4, seed=0).learn(1100)
     lowest, highest = range_of(model)
-    # A table keeps the meaning of its rows; and what is learned in a second call is learned from its first step.
+    # The rows of a table keep their meaning, and a second call learns from its first step on.
     before = model.policy.q_table.clone()
     model.learn(20)
     assert (range_of(model)[0] == lowest).all()
@@ -305,7 +305,7 @@ def test_prediction_before_measuring() -> None:
 
 
 def test_scattered_points_stay_where_they_are_when_ranges_are_measured() -> None:
-    # From (1, 0.5) the second is nearer in observation units, and the first in shares of the range, 8 and 1 wide.
+    # From (1, 0.5) the second point is nearer in observation units, and the first relative to the ranges of 8 and 1.
     places = np.array([[3.0, 0.5], [1.0, 0.9]])
     model = KNNTD(Wave([-np.inf, 0.0], [np.inf, 1.0]), points=places, n_neighbors=1, seed=0)
     assert model.policy.perceive(np.array([1.0, 0.5])).indices.tolist() == [[1]]
@@ -314,7 +314,7 @@ def test_scattered_points_stay_where_they_are_when_ranges_are_measured() -> None
     assert model.policy.perceive(np.array([1.0, 0.5])).indices.tolist() == [[0]]
 
 
-def test_dimension_that_never_moves_is_no_obstacle() -> None:
+def test_a_constant_dimension_is_allowed() -> None:
     env = gym.wrappers.TransformObservation(
         Wave([-np.inf, 0.0], [np.inf, 1.0]),
         lambda observation: np.array([7.0, observation[1]]),

@@ -13,7 +13,7 @@ from sb3_knntd import KNNTD
 
 
 def newest(name: str) -> str:
-    """The id of an environment in whatever version this gymnasium has."""
+    """The id of an environment in the version of the installed gymnasium."""
     versions = [spec for spec in gym.registry.values() if spec.name == name and spec.namespace is None]
     if not versions:
         pytest.skip(f"this gymnasium has no {name}")
@@ -21,7 +21,7 @@ def newest(name: str) -> str:
 
 
 def optimal_values(env: gym.Env[Any, Any], gamma: float) -> np.ndarray:
-    """Value iteration on the model that toy-text environments show, shape (n_states, n_actions)."""
+    """Value iteration on the model of a toy-text environment, shape (n_states, n_actions)."""
     model = env.unwrapped.P  # type: ignore[attr-defined]
     values = np.zeros((env.observation_space.n, env.action_space.n))  # type: ignore[attr-defined]
     for _ in range(1_000):
@@ -50,7 +50,7 @@ def greedy_return(model: KNNTD, env_id: str, n_episodes: int, **kwargs: Any) -> 
 def test_frozen_lake_without_ice(target: str) -> None:
     env_id = newest("FrozenLake")
     env = gym.make(env_id, is_slippery=False)
-    # Values above what can be had make the learner try what it has not tried.
+    # Optimistic initial values make the learner try all actions.
     model = KNNTD(env, target=target, gamma=0.95, learning_rate=0.5, trace_decay=0.9, initial_value=1.0, seed=0)
     model.learn(1_500)
     assert model.policy.q_table.shape == (16, 4)
@@ -60,13 +60,13 @@ def test_frozen_lake_without_ice(target: str) -> None:
 @pytest.mark.parametrize("target", ["sarsa", "q_learning"])
 def test_cliff_walking(target: str) -> None:
     env_id = newest("CliffWalking")
-    # Nothing here is left to chance, so that one step may overwrite what was known.
+    # The environment is deterministic, so a step size of 1 is correct.
     model = KNNTD(
         gym.make(env_id, max_episode_steps=200), target=target, gamma=1.0, learning_rate=1.0, trace_decay=0.0,
         exploration_initial_eps=0.0, seed=0,
     )  # fmt: skip
     model.learn(10_000)
-    # The edge of the cliff is the shortest way, 13 steps.
+    # The shortest path, along the edge of the cliff, has 13 steps.
     assert greedy_return(model, env_id, 1) == -13.0
 
 
@@ -79,7 +79,7 @@ def test_values_are_those_of_value_iteration() -> None:
     )  # fmt: skip
     model.learn(5_000)
     learned, optimal = model.policy.q_table.numpy(), optimal_values(env, 0.9)
-    # A walk at random rarely gets far down: compare along the best path, where its steps are best known.
+    # Random actions rarely reach distant states: compare along the best path, where the values are most exact.
     assert np.abs(learned - optimal)[[0, 4, 8]].max() < 1e-12
     assert optimal[0].max() > 0
 
@@ -93,7 +93,7 @@ def test_frozen_lake(target: str) -> None:
         initial_value=0.5, exploration_initial_eps=0.1, seed=0,
     )  # fmt: skip
     model.learn(60_000)
-    # The best there is wins 82 games in 100 without the limit of 100 steps.
+    # The optimal policy wins 82 of 100 episodes without the limit of 100 steps.
     assert greedy_return(model, env_id, 500) >= 0.7
 
 
@@ -106,5 +106,5 @@ def test_taxi(target: str) -> None:
     )
     assert model.policy.q_table.shape == (500, 6)
     model.learn(300_000)
-    # The mean of the shortest ways is 7.9.
+    # The mean return of the shortest paths is 7.9.
     assert greedy_return(model, env_id, 300) >= 7.0

@@ -1,4 +1,4 @@
-"""TensorBoard, as a user sees it: a run of each algorithm, in a browser."""
+"""TensorBoard in a browser, with a run of each algorithm."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 
 @pytest.fixture(scope="module")
 def screenshots() -> Iterator[Any]:
-    """The script that makes the pictures of the documentation."""
+    """The script that makes the screenshots of the documentation."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "docs"))
         module = importlib.import_module("screenshots")
@@ -25,7 +25,7 @@ def screenshots() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def board(screenshots: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Any]]:
-    """TensorBoard's address and a page of a browser, on short runs of both algorithms with all callbacks."""
+    """TensorBoard's address and a browser page, for short runs of both algorithms with all callbacks."""
     logs = screenshots.train(tmp_path_factory.mktemp("runs"), n_steps=2000, n_pictures=1)
     with screenshots.open_tensorboard(logs) as opened:
         yield opened
@@ -34,7 +34,7 @@ def board(screenshots: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterato
 RUNS = ["KNNTD_1", "ExA_1"]
 
 
-# What is waited for and does not come is a TimeoutError that names it.
+# A missing element raises a TimeoutError that names it.
 
 
 def test_scalars_are_shown(screenshots: Any, board: tuple[str, Any]) -> None:
@@ -45,7 +45,7 @@ def test_scalars_are_shown(screenshots: Any, board: tuple[str, Any]) -> None:
     for tag in screenshots.SCALARS:
         chart = page.locator("tf-scalar-card:visible", has_text=tag)
         curves = [path.get_attribute("d") or "" for path in chart.locator("path.line").all()]
-        # Each run's has a point for each of its logs.
+        # Each run has a point for each of its logs.
         assert sum(curve.count("L") >= 10 for curve in curves) >= len(RUNS), tag
 
 
@@ -67,10 +67,10 @@ def test_hparams_are_shown(screenshots: Any, board: tuple[str, Any]) -> None:
     screenshots.show(page, url, "hparams")
     for run in RUNS:
         page.get_by_text(run, exact=True).filter(visible=True).first.wait_for()
-    # TensorBoard lists the hyperparameters of one of the runs: what only the other algorithm has may be missing.
+    # TensorBoard lists the hyperparameters of only one run: those of the other algorithm may be missing.
     for name in ("algorithm", "env", "gamma", "learning_rate", "n_neighbors", "trace_decay"):
         page.get_by_text(name, exact=True).filter(visible=True).first.wait_for()
     for metric in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "train/td_error", "time/fps"):
         page.get_by_text(metric, exact=True).first.wait_for(state="attached")
-    # Mountain-Car's first episodes last 200 steps, at -1 each.
+    # The first episodes of Mountain-Car have 200 steps with a reward of -1.
     page.locator("vaadin-grid-cell-content", has_text="-200.00").first.wait_for()

@@ -1,4 +1,4 @@
-"""A policy as torch's own formats have it: what is traced or exported acts as ``predict`` does."""
+"""Traced and exported policies return the actions of ``predict``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = [
 ]
 
 SCATTERED = np.random.default_rng(5).uniform(DriftEnv.LOW, DriftEnv.HIGH, size=(300, 2))
-ROUND_PLACES = np.round(SCATTERED, 1)  # many of the points are in the same place, and tie
+ROUND_PLACES = np.round(SCATTERED, 1)  # many of the points coincide, and tie
 
 CONFIGURATIONS: dict[str, dict[str, Any]] = {
     "defaults": {},
@@ -42,7 +42,7 @@ def make_model(algorithm: type[KNNTD | ExA], **arguments: Any) -> KNNTD | ExA:
 
 
 def traced(policy: Any, example: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
-    # As it is taken elsewhere, in a file.
+    # Through a file, as in deployment.
     file = io.BytesIO()
     th.jit.save(th.jit.trace(policy.eval(), example), file)
     file.seek(0)
@@ -56,7 +56,7 @@ def exported(policy: Any, example: th.Tensor) -> Callable[[th.Tensor], th.Tensor
 
 @pytest.fixture
 def places() -> np.ndarray:
-    """Two thousand observations within the bounds and beyond them, and some on points and halfway between them."""
+    """Two thousand observations inside and outside the bounds, some on points and halfway between them."""
     width = DriftEnv.HIGH - DriftEnv.LOW
     random = np.random.default_rng(7).uniform(DriftEnv.LOW - 0.3 * width, DriftEnv.HIGH + 0.3 * width, size=(2_000, 2))
     on_lattice = DriftEnv.LOW + width * np.random.default_rng(8).integers(0, 17, size=(200, 2)) / 16
@@ -66,10 +66,10 @@ def places() -> np.ndarray:
 @pytest.mark.parametrize("algorithm", [KNNTD, ExA])
 @pytest.mark.parametrize("how", [traced, exported])
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_it_acts_as_predict_does(
+def test_it_acts_like_predict(
     algorithm: type[KNNTD | ExA], how: Callable[..., Any], name: str, places: np.ndarray
 ) -> None:
-    # In the middle of an episode: what was learned last is in it as well.
+    # In the middle of an episode: the latest updates must be included.
     model = make_model(algorithm, **CONFIGURATIONS[name]).learn(1_003)
     policy = how(model.policy, th.from_numpy(places[:2]))
     expected, _ = model.predict(places, deterministic=True)
@@ -102,27 +102,27 @@ def test_actions_that_do_not_start_at_0_and_whole_ones(places: np.ndarray) -> No
         expected, _ = model.predict(places, deterministic=True)
         assert len(np.unique(expected)) > 1
         actions = traced(model.policy, th.from_numpy(places[:3]))(th.from_numpy(places))
-        # Sums of doubles may differ in their last digit.
+        # Sums of float64 may differ in their last digit.
         np.testing.assert_allclose(actions.numpy(), expected, rtol=0.0, atol=1e-15)
         assert actions.numpy().dtype == expected.dtype
 
 
 @pytest.mark.skipif(not jit.AVAILABLE, reason="hashed tables need numba")
 @pytest.mark.parametrize("how", [traced, exported])
-def test_a_hashed_table_says_that_it_cannot_be(how: Callable[..., Any]) -> None:
+def test_a_hashed_table_cannot_be_exported(how: Callable[..., Any]) -> None:
     model = make_model(KNNTD, policy_kwargs={"table": "hashed"}).learn(100)
     with pytest.raises(ValueError, match=r"cannot be traced or exported.*policy_kwargs=\{'table': 'dense'\}"):
         how(model.policy, th.zeros(2, 2))
 
 
 @pytest.mark.parametrize("how", [traced, exported])
-def test_weights_that_no_one_can_record_say_so(how: Callable[..., Any]) -> None:
+def test_weights_without_torch_operations_cannot_be_exported(how: Callable[..., Any]) -> None:
     model = make_model(KNNTD, points=(5, 5), weights=lambda d2: [[1.0] * d2.shape[1]] * d2.shape[0]).learn(100)
     with pytest.raises(ValueError, match="function of torch operations"):
         how(model.policy, th.zeros(2, 2))
 
 
-def test_what_is_traced_stays_as_it_was(places: np.ndarray) -> None:
+def test_a_traced_policy_does_not_change(places: np.ndarray) -> None:
     model = make_model(KNNTD).learn(1_000)
     expected, _ = model.predict(places, deterministic=True)
     policy = traced(model.policy, th.from_numpy(places[:2]))

@@ -1,4 +1,4 @@
-"""A model in use: making it, training it again, moving it to another environment, changing its parts."""
+"""Using a model: construction, continued training, other environments, and parameters."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_initial_value(make_model: MakeModel) -> None:
 # ----------------------------------------------------------- training again
 
 
-def test_learning_on_keeps_counting_and_the_table(make_model: MakeModel) -> None:
+def test_continued_learning_keeps_the_count_and_the_table(make_model: MakeModel) -> None:
     model = make_model().learn(100)
     table = model.policy.q_table.clone()
     model.learn(0, reset_num_timesteps=False)
@@ -107,13 +107,13 @@ def test_learning_on_keeps_counting_and_the_table(make_model: MakeModel) -> None
     assert not th.equal(model.policy.q_table, table)
 
 
-def test_learning_on_stays_in_the_episode(make_model: MakeModel) -> None:
-    # Nine steps is the first episode long, whatever calls they are spread over.
+def test_continued_learning_stays_in_the_episode(make_model: MakeModel) -> None:
+    # The first episode has nine steps, also over several calls.
     model = make_model().learn(4).learn(5, reset_num_timesteps=False)
     assert [info["l"] for info in model.ep_info_buffer or ()] == [9]
 
 
-def test_learning_anew_counts_anew_in_new_episodes_with_the_same_table(make_model: MakeModel) -> None:
+def test_new_learning_resets_the_count_and_episodes_but_not_the_table(make_model: MakeModel) -> None:
     model = make_model(learning_rate=0.0, initial_value=2.0).learn(4)
     model.policy.q_table[0, 0] = 5.0
     model.learn(14)
@@ -124,7 +124,7 @@ def test_learning_anew_counts_anew_in_new_episodes_with_the_same_table(make_mode
 
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_traces_do_not_outlive_a_reset(algorithm: Algorithm, make_grid: MakeGrid, n_envs: int) -> None:
-    # With λ = γ = 1 whatever was visited since the traces began is credited with every error.
+    # With λ = γ = 1 every error updates all states visited since the traces were cleared.
     venv = DummyVecEnv([lambda: make_grid(lengths=[100])] * n_envs)
     model = algorithm(
         venv, gamma=1.0, trace_decay=1.0, learning_rate=0.5, exploration_initial_eps=0.0, tie_break="first"
@@ -148,7 +148,7 @@ def test_get_and_set_env(make_model: MakeModel, make_venv: MakeVenv) -> None:
     assert model.get_env() is first
     model.set_env(second)
     assert model.get_env() is second
-    # The new environment is in its first episode, of nine steps.
+    # The new environment is in its first episode of nine steps.
     model.learn(9, reset_num_timesteps=False)
     assert model.num_timesteps == 39
     assert [info["l"] for info in model.ep_info_buffer or ()][-1] == 9
@@ -221,7 +221,7 @@ def test_parameters_go_from_model_to_model(make_model: MakeModel, observations: 
     other.set_parameters(learned.get_parameters())
     assert th.equal(other.policy.q_table, learned.policy.q_table)
     assert th.equal(other.policy.q_values(observations), learned.policy.q_values(observations))
-    # It is a copy: what the one learns from now on is not the other's.
+    # It is a copy: later learning of one model does not affect the other.
     other.learn(50)
     assert not th.equal(other.policy.q_table, learned.policy.q_table)
 
@@ -253,7 +253,7 @@ def test_parameters_that_do_not_fit_are_refused(make_model: MakeModel) -> None:
         model.set_parameters(make_model(points=(3, 3)).get_parameters())
 
 
-def test_parameters_need_no_code_to_be_read(make_model: MakeModel) -> None:
+def test_parameters_are_loaded_without_running_code(make_model: MakeModel) -> None:
     model, memory = make_model().learn(100), io.BytesIO()
     th.save(model.get_parameters(), memory)
     memory.seek(0)

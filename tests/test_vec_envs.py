@@ -1,4 +1,4 @@
-"""Vectorised environments of every kind, one environment in them or many."""
+"""Vectorised environments of all kinds, with one or many environments."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_learn_and_evaluate(make_model: MakeModel, make_venv: MakeVenv, vec_env_
 
 
 def test_steps_are_counted_over_all_environments(make_model: MakeModel, make_venv: MakeVenv) -> None:
-    # The last round of steps is made whole, as in SB3.
+    # The last step of all environments is completed, as in SB3.
     assert make_model(make_venv(4)).learn(50).num_timesteps == 52
 
 
@@ -71,12 +71,12 @@ def test_schedules_stay_within_the_run(make_model: MakeModel, make_venv: MakeVen
 
     make_model(make_venv(n_envs), learning_rate=schedule).learn(100)
     assert max(asked) <= 1.0
-    # Seven environments overshoot a hundred steps; what is asked for beyond the end is the end.
+    # Seven environments overshoot a hundred steps; schedules stay at their final value beyond the end.
     assert min(asked) >= 0.0
 
 
-def test_learning_rate_falling_to_nothing_never_is_negative(make_model: MakeModel, make_venv: MakeVenv) -> None:
-    # One step of each of 50 environments, of 10 asked for: the progress that remains would be -4.
+def test_a_learning_rate_decreasing_to_0_is_never_negative(make_model: MakeModel, make_venv: MakeVenv) -> None:
+    # A step of 50 environments for 10 requested steps: the remaining progress would be -4.
     model = make_model(make_venv(50), learning_rate=lambda progress: progress, initial_value=0.0)
     model.learn(10)
     assert not model.policy.q_table.any()
@@ -84,14 +84,14 @@ def test_learning_rate_falling_to_nothing_never_is_negative(make_model: MakeMode
 
 def test_environments_share_one_table(make_model: MakeModel, make_venv: MakeVenv) -> None:
     model = make_model(make_venv(6)).learn(6)
-    # Six first steps, each from another place: more points are learned at than one step reaches.
+    # Six first steps from different states update more points than a single step.
     assert int(model.policy.q_table.any(dim=1).sum()) > 4
 
 
 def test_many_equal_environments_learn_as_stably_as_one(env_cls: type[DriftEnv], make_model: MakeModel) -> None:
     settings = {"exploration_initial_eps": 0.0, "tie_break": "first"}
     one = make_model(DummyVecEnv([env_cls]), **settings).learn(60)
-    # Sixty-four times the same must not be a step sixty-four times as large.
+    # Sixty-four equal transitions must not make the update sixty-four times as large.
     many = make_model(DummyVecEnv([env_cls] * 64), **settings).learn(60 * 64)
     th.testing.assert_close(many.policy.q_table, one.policy.q_table)
 
@@ -126,7 +126,7 @@ def test_normalised_observations_are_measured(algorithm: Algorithm, make_venv: M
     model = algorithm(venv, points=5, seed=0).learn(1300)
     check_learned(model, 1300 + -1300 % n_envs)
     assert model.get_vec_normalize_env() is venv
-    # The space speaks of ±3 and ±1, and of what was divided by its spread: the points go by what was seen.
+    # The space gives ±3 and ±1, but observations are normalised: the points follow the measured range.
     seen = [venv.reset()]
     for _ in range(30):
         seen.append(venv.step(np.stack([venv.action_space.sample()] * n_envs))[0])
@@ -155,7 +155,7 @@ def test_given_bounds_are_those_of_normalised_observations(algorithm: Algorithm,
 def test_truncation_bootstraps_from_the_normalised_last_observation(
     algorithm: Algorithm, env_cls: type[DriftEnv]
 ) -> None:
-    # At a truncation that is its whole episode, r + γ Q(s') is all there is to learn; Q(s') = 10 everywhere.
+    # In an episode of a single truncated step the target is r + γ Q(s'), with Q(s') = 10 everywhere.
     venv = VecNormalize(make_vec_env(lambda: env_cls(lengths=[1], ends=["truncated"]), 1), norm_reward=False)
     model = algorithm(
         venv, points=1, bounds=([-2, -2], [2, 2]), n_neighbors=1, learning_rate=1.0, gamma=0.5, initial_value=10.0
@@ -179,7 +179,7 @@ def test_normalisation_is_saved_beside(algorithm: Algorithm, make_venv: MakeVenv
     assert np.array_equal(again.normalize_obs(places), normalised)
     assert th.equal(loaded.policy.q_values(normalised), model.policy.q_values(normalised))
     loaded.learn(100, reset_num_timesteps=False)
-    # The ranges have been measured, once and for all.
+    # The ranges are measured only once.
     assert th.equal(loaded.policy.points, model.policy.points)
     assert not th.equal(loaded.policy.q_table, model.policy.q_table)
 
@@ -188,7 +188,7 @@ def test_normalisation_is_saved_beside(algorithm: Algorithm, make_venv: MakeVenv
 
 
 class Still(gym.Env[Any, Any]):
-    """Stays where it is, at a reward of 1 a step."""
+    """Stays in its state, with a reward of 1 per step."""
 
     def __init__(self, place: list[float], length: int, env_cls: type[DriftEnv]) -> None:
         self.place = np.array(place, dtype=np.float32)
@@ -205,9 +205,9 @@ class Still(gym.Env[Any, Any]):
         return self.place, 1.0, self.elapsed >= self.length, False, {}
 
 
-def test_end_of_one_environment_leaves_the_others(env_cls: type[DriftEnv], make_model: MakeModel) -> None:
+def test_the_end_of_one_episode_does_not_affect_the_others(env_cls: type[DriftEnv], make_model: MakeModel) -> None:
     def venv() -> VecEnv:
-        # Two far corners, so that the environments meet at no point; the first ends at every step.
+        # Two distant corners, so that the environments share no points; the first one ends at every step.
         return DummyVecEnv(
             [lambda: Still([-0.9, -0.04], 1, env_cls), lambda: Still([0.4, 0.05], 100, env_cls)],
         )

@@ -1,4 +1,4 @@
-"""RL Zoo's commands with this package's algorithms, used as a user would."""
+"""RL Zoo's commands with this package's algorithms, as a user runs them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from sb3_knntd.zoo.configuration_first import ConfigurationFirst
 from sb3_knntd.zoo.schedules import with_schedules
 from sb3_knntd.zoo.search_space import OBS_DIM, SearchSpace, attributes, study_values
 
-# SB3 silences the one when it is imported, which pytest undoes; the other is RL Zoo's word on an unnamed study.
+# SB3 silences the first warning at import, which pytest undoes; the second is RL Zoo's about an unnamed study.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:rich is experimental"),
     pytest.mark.filterwarnings("ignore:You passed a remote storage"),
@@ -54,7 +54,7 @@ def search_space(algo: str) -> SearchSpace:
 
 
 ENVS = {"knntd": "MountainCar-v0", "exa": "Pendulum-v1"}
-#: Other points than the configurations have.
+#: Points that differ from those of the configurations.
 POINTS = {"knntd": [8, 7], "exa": [5, 4, 3]}
 COMMAND = [sys.executable, "-m", "sb3_knntd.zoo"]
 OPTIMIZE = ["--optimize", "-n", "300", "--n-evaluations", "2", "--eval-episodes", "1", "--no-optim-plots"]
@@ -79,7 +79,7 @@ def saved_model(algo: str, run: Path) -> Any:
 
 @pytest.fixture(scope="module", params=["knntd", "exa"])
 def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    """The algorithm, and the folder of a run of 600 steps with other points than those of the configuration."""
+    """The algorithm, and the folder of a run of 600 steps with other points than the configuration's."""
     algo = request.param
     folder = tmp_path_factory.mktemp("logs")
     options = ["-n", 600, "--eval-freq", 300, "--save-freq", 300, "--tensorboard-log", folder / "tb"]
@@ -99,7 +99,7 @@ def test_train_stores_model_checkpoints_evaluations_and_settings(trained: tuple[
     model = saved_model(algo, run)
     assert model.num_timesteps == 600
     assert model.device.type == "cpu"
-    # The configuration is found without naming it, and the command line goes first.
+    # The configuration is found by default, and the command line overrides it.
     configured = yaml.safe_load((Path(__file__).parent.parent / "zoo_configs" / f"{algo}.yml").read_text())[env]
     assert (model.gamma, model.bandwidth) == (configured["gamma"], configured["bandwidth"])
     assert (model.points, model.n_neighbors) == (POINTS[algo], 3)
@@ -144,7 +144,7 @@ def test_enjoy_loads_what_is_asked_for(
     assert f"Loading {run / file}" in capsys.readouterr().out
 
 
-def test_a_seed_given_to_load_decides_what_is_explored(trained: tuple[str, Path]) -> None:
+def test_a_seed_given_to_load_determines_exploration(trained: tuple[str, Path]) -> None:
     algo, run = trained
     observation = make_vec_env(ENVS[algo], seed=0).reset()
 
@@ -158,14 +158,14 @@ def test_a_seed_given_to_load_decides_what_is_explored(trained: tuple[str, Path]
     assert explored(None) == explored(None)
 
 
-def test_training_goes_on_from_a_saved_model(trained: tuple[str, Path], tmp_path: Path) -> None:
+def test_training_continues_from_a_saved_model(trained: tuple[str, Path], tmp_path: Path) -> None:
     algo, run = trained
     env = ENVS[algo]
     agent = run / f"{env}.zip"
     frozen = train(tmp_path, algo, env, "-n", 300, "--eval-freq", -1, "-i", agent, "-params", "learning_rate:0.0")
     before, after = saved_model(algo, run), saved_model(algo, frozen)
     assert after.num_timesteps == 300
-    # The points it was trained with, not those of the configuration.
+    # The points of the saved model, not those of the configuration.
     assert after.policy.points.shape == before.policy.points.shape
     np.testing.assert_array_equal(after.policy.q_table, before.policy.q_table)
     learned = train(tmp_path, algo, env, "-n", 300, "--eval-freq", -1, "-i", agent)
@@ -173,7 +173,7 @@ def test_training_goes_on_from_a_saved_model(trained: tuple[str, Path], tmp_path
 
 
 @pytest.mark.parametrize(("name", "value"), [("points", 4), ("n_neighbors", 2)])
-def test_training_cannot_go_on_with_another_table(
+def test_training_cannot_continue_with_another_table(
     trained: tuple[str, Path], name: str, value: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     algo, run = trained
@@ -247,7 +247,7 @@ def test_environments_of_this_package(tmp_path: Path, monkeypatch: pytest.Monkey
     assert run.name == f"{name}_1"
     zoo("enjoy", "--algo", "knntd", "--env", env, "-f", tmp_path, "--no-render", "-n", 5)
 
-    # RL Zoo's plots find runs by the names of their folders, and set a style when they are imported.
+    # RL Zoo's plots find runs by folder names, and set a style at import.
     shown: list[Any] = []
     monkeypatch.setattr(plt, "show", lambda: shown.extend(plt.gca().get_lines()))
     with matplotlib.rc_context():
@@ -263,7 +263,7 @@ def test_environments_of_this_package(tmp_path: Path, monkeypatch: pytest.Monkey
     assert result["timesteps"].tolist() == [1500, 3000]
 
 
-def test_algorithms_of_rl_zoo_go_on_working(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_algorithms_of_rl_zoo_still_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = train(tmp_path, "dqn", "CartPole-v1", "-n", 100, "--eval-freq", -1)
     assert re.search(r"rl_zoo3.hyperparams.dqn\.yml", capsys.readouterr().out)
     assert DQN.load(run / "CartPole-v1.zip").num_timesteps >= 100
@@ -272,7 +272,7 @@ def test_algorithms_of_rl_zoo_go_on_working(tmp_path: Path, capsys: pytest.Captu
 # ------------------------------------------------------------------ schedules
 
 
-def test_schedules_in_words() -> None:
+def test_schedules_as_strings() -> None:
     falling = parse_schedule("learning_rate", "lin_0.5")
     assert [falling(progress) for progress in (1.0, 0.5, 0.0)] == pytest.approx([0.5, 0.25, 0.0])
     rising = parse_schedule("trace_decay", "lin_0.8_0.9")
@@ -285,7 +285,7 @@ def test_schedules_in_words() -> None:
 
 
 @pytest.mark.parametrize("word", ["cos_0.5", "lin", "lin_", "lin_x", "lin_0.5_0.1_3", "0.5", ""])
-def test_a_word_that_is_no_schedule(word: str) -> None:
+def test_a_string_that_is_not_a_schedule(word: str) -> None:
     with pytest.raises(ValueError, match=f"trace_decay must be a number, 'lin_START'.*got {word!r}"):
         with_schedules({"trace_decay": word})
 
@@ -294,7 +294,7 @@ def test_a_word_that_is_no_schedule(word: str) -> None:
 
 
 def make_env(algo: str, obs_dim: int) -> gym.Env[Any, Any]:
-    """An environment to build a model for, never stepped."""
+    """An environment for building a model, never stepped."""
     env = gym.Env[Any, Any]()
     box = spaces.Box(-1.0, 1.0, (obs_dim,), np.float32)
     env.observation_space = box if obs_dim else spaces.Discrete(5)
@@ -325,7 +325,7 @@ def test_search_space(algo: str, obs_dim: int) -> None:
     trial = asked(obs_dim, {})
     search_space(algo).sample(trial, 0, 1, {})
     assert ("points_per_dimension" in trial.params) == (obs_dim > 0)
-    # The corners of what is searched, and what was drawn.
+    # The corners of the search space, and random samples.
     distributions = trial.distributions.items()
     for params in (trial.params, *({name: ends(d)[end] for name, d in distributions} for end in (0, 1))):
         arguments = search_space(algo).sample(with_attributes(optuna.trial.FixedTrial(params), obs_dim, {}), 0, 1, {})
@@ -495,7 +495,7 @@ def test_unknown_algorithm(capsys: pytest.CaptureFixture[str]) -> None:
     assert sys.argv == argv
 
 
-#: What is wrong, by the arguments of ``train``, and what the line says of it.
+#: Invalid arguments of ``train``, and the part of the message that names the error.
 MISTAKES: dict[str, tuple[list[str], str]] = {
     "environment": (["--env", "sb3_knntd/MountainCar-v"], "you maybe meant sb3_knntd/MountainCar-v0?"),
     "spaces": (["--env", "Pendulum-v1"], "KNNTD takes actions in a Discrete space"),
@@ -539,7 +539,7 @@ def mistaken_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def line_of(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """Run a command that is refused; return the only line on standard error."""
+    """Run a command that must be refused; return the single line on standard error."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
         main(argv)
@@ -552,7 +552,7 @@ def line_of(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 @pytest.mark.usefixtures("mistaken_files")
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_argument_is_one_line(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments, says = MISTAKES[mistake]
     argv = ["train", "--algo", "knntd", "--env", "MountainCar-v0", "-n", "30", "-f", "logs", "--eval-freq", "-1"]
     assert says in line_of([*argv, *arguments], capsys)
@@ -567,22 +567,22 @@ def test_a_mistake_is_one_line(mistake: str, capsys: pytest.CaptureFixture[str])
         (["record_video", "--env", "MountainCar-v0", "-f", "nowhere"], "The nowhere/knntd folder was not found"),
     ],
 )
-def test_a_mistake_in_looking_at_an_agent_is_one_line(
+def test_a_wrong_argument_of_enjoy_is_one_line(
     arguments: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert says in line_of([arguments[0], "--algo", "knntd", *arguments[1:]], capsys)
 
 
-def test_a_mistake_is_traced_on_demand(tmp_path: Path) -> None:
+def test_traceback_is_shown_on_demand(tmp_path: Path) -> None:
     arguments = ["--algo", "knntd", "--env", "MountainCar-v0", "-f", str(tmp_path), "-params", "gamma:2"]
     with pytest.raises(CommandError, match="gamma") as error:
         main(["--traceback", "train", *arguments])
     assert isinstance(error.value.__cause__, ValueError)
 
 
-def test_what_goes_wrong_in_training_is_not_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fault of an environment or of this package is found by its traceback."""
+def test_errors_during_training_are_not_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors of environments or of this package keep their traceback."""
 
     def step(env: MountainCarEnv, action: int) -> Any:
         raise ValueError("a fault of the environment")
@@ -592,7 +592,7 @@ def test_what_goes_wrong_in_training_is_not_hidden(tmp_path: Path, monkeypatch: 
         train(tmp_path, "knntd", "MountainCar-v0", "-n", 30, "--eval-freq", -1)
 
 
-def test_values_that_diverge_are_told_of_in_one_line(
+def test_diverging_values_are_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def learn(model: KNNTD, *arguments: Any, **options: Any) -> KNNTD:
@@ -625,7 +625,7 @@ def test_other_commands_do_not_wait_for_rl_zoo() -> None:
     assert done.stdout.split() == ["False", "False"]
 
 
-def test_register_makes_them_known_to_rl_zoo() -> None:
+def test_register_adds_them_to_rl_zoo() -> None:
     import rl_zoo3.train
 
     register()

@@ -1,4 +1,4 @@
-"""Deterministic environments whose episodes end when and how a test wants, and a recorder."""
+"""Deterministic environments with specified episode ends, and a recorder."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-# A step may report both at once; that is a termination, for there is nothing left to bootstrap from.
+# A step may report both; this is a termination, without bootstrapping.
 ENDS = {
     "terminated": (True, False),
     "truncated": (False, True),
@@ -23,7 +23,7 @@ ENDS = {
 
 
 class EpisodeEnv(gym.Env[Any, Any]):
-    """Counts episodes and ends them: the i-th has ``lengths[i]`` steps and ends with ``ends[i]``, in turn."""
+    """Counts and ends episodes: episode i has ``lengths[i]`` steps and ends with ``ends[i]``, cyclically."""
 
     def __init__(self, lengths: Sequence[int] = (9, 14, 6), ends: Sequence[str] = ("terminated", "truncated")) -> None:
         self.lengths = tuple(lengths)
@@ -45,7 +45,7 @@ class EpisodeEnv(gym.Env[Any, Any]):
 class DriftEnv(EpisodeEnv):
     """A point on a hilly line, pushed left, not at all, or right; two dimensions of very different scale.
 
-    :param offset: shifts where the episodes start, so that several environments go different ways
+    :param offset: shifts the initial states, so that several environments differ
     """
 
     LOW = np.array([-1.0, -0.05])
@@ -61,7 +61,7 @@ class DriftEnv(EpisodeEnv):
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self._begin_episode()
-        # The golden section spreads the starts without a random number and without meeting a lattice plane.
+        # The golden ratio spreads the initial states without random numbers and without hitting a lattice plane.
         self.x = -0.9 + 1.1 * ((0.6180339887 * (self.episode + 1) + self.offset) % 1.0)
         self.v = 0.0123 * np.sin(1.0 + 2.3 * self.episode + self.offset)
         return self._observe(), {}
@@ -78,7 +78,7 @@ class DriftEnv(EpisodeEnv):
 
 
 class PushEnv(DriftEnv):
-    """The drifting point, pushed by all numbers of a Box action, each with a different effect."""
+    """The drifting point, pushed by all components of a Box action, each with a different effect."""
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class PushEnv(DriftEnv):
 
 
 class GridEnv(EpisodeEnv):
-    """A torus of cells, seen as one number (``discrete``), two (``multi_discrete``) or a ``box`` of ints."""
+    """A torus of cells, observed as one number (``discrete``), two (``multi_discrete``) or a ``box`` of ints."""
 
     MOVES = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
@@ -147,7 +147,7 @@ class GridEnv(EpisodeEnv):
 
 
 class ScriptedEnv(EpisodeEnv):
-    """Shows the given observations one after the other whatever is done; the episode ends with the last."""
+    """Returns the given observations in order, independent of the actions; the episode ends with the last one."""
 
     def __init__(
         self, observations: ArrayLike, rewards: Sequence[float], end: str = "never", n_actions: int = 2
@@ -171,7 +171,7 @@ class ScriptedEnv(EpisodeEnv):
 
 
 class StillEnv(ScriptedEnv):
-    """An environment to hang a model on that is only asked, never trained."""
+    """An environment for models that are only used for prediction."""
 
     def __init__(self, n_dims: int, n_actions: int = 3) -> None:
         super().__init__(np.zeros((2, n_dims)), [0.0], end="terminated", n_actions=n_actions)
@@ -179,7 +179,7 @@ class StillEnv(ScriptedEnv):
 
 @dataclass
 class VecStep:
-    """One step of all environments; ``arrived`` holds the true last observations where episodes ended."""
+    """One step of all environments; ``arrived`` has the true last observations of ended episodes."""
 
     observations: Any
     actions: Any
@@ -190,7 +190,7 @@ class VecStep:
 
 
 class RecordingVecEnv(VecEnvWrapper):
-    """Keeps everything that passes between a learner and its environments."""
+    """Records the whole interaction between a learner and its environments."""
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
