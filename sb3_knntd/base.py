@@ -1,4 +1,4 @@
-"""What KNNTD and ExA share: parameters, spaces, the learner, saving and loading."""
+"""Base class of KNNTD and ExA: parameters, spaces, the learner, saving and loading."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ from sb3_knntd.q_table import DenseTable
 SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
 
 NONE_TRUNCATED: dict[int, np.ndarray] = {}
-#: What NumPy's global generator takes.
+#: The largest seed of NumPy's global generator.
 LARGEST_SEED = 2**32 - 1
 
 
 class KNNAlgorithm(OnlineAlgorithm):
     """
-    What the algorithms of this package share: parameters, spaces, the learner, saving and loading.
+    Base class of the algorithms of this package: parameters, spaces, the learner, saving and loading.
 
     The parameters are those of :class:`~sb3_knntd.KNNTD`.
     """
@@ -84,9 +84,9 @@ class KNNAlgorithm(OnlineAlgorithm):
     initial_value: Any = FixedHyperparameter()
 
     _is_set_up = False
-    #: What a saved file calls the algorithm: subclasses read each other's.
+    #: Name of the algorithm in saved files, the same for all subclasses, which can load each other's files.
     _algorithm: ClassVar[str]
-    #: What an action space must be, and what to do with another.
+    #: Type of the supported action spaces, and advice for unsupported ones.
     _supported_action_space: ClassVar[type[spaces.Space[Any]]]
     _action_space_advice: ClassVar[str]
 
@@ -137,7 +137,7 @@ class KNNAlgorithm(OnlineAlgorithm):
             support_multi_env=True,
             seed=seed,
         )
-        #: Which algorithm a saved file is of.
+        #: Name of the algorithm, for saved files.
         self.algorithm = self._algorithm
         self.gamma = gamma
         self.trace_decay = trace_decay
@@ -153,7 +153,7 @@ class KNNAlgorithm(OnlineAlgorithm):
         self.tie_break = tie_break
         self.initial_value = initial_value
 
-        # Where the points lie depends on it.
+        # The positions of the points depend on it.
         self._normalized = normalizes_observations(self.env)
         #: ε or the temperature at the last step
         self.exploration_rate = 0.0
@@ -165,7 +165,7 @@ class KNNAlgorithm(OnlineAlgorithm):
         """Check the parameters of action selection and make the selector."""
 
     def _policy_arguments(self) -> dict[str, Any]:
-        """Arguments of the policy besides those that all algorithms have."""
+        """Arguments of the policy other than those common to all algorithms."""
         return {}
 
     @abstractmethod
@@ -178,7 +178,7 @@ class KNNAlgorithm(OnlineAlgorithm):
     def _sort_out(
         cls, policy: str | type[BasePolicy] | GymEnv, env: GymEnv | str | None
     ) -> tuple[type[KNNPolicy], GymEnv | str | None]:
-        """Tell policy and environment apart: either order of giving them works."""
+        """Distinguish policy and environment, which may be passed in either order."""
         name = next(iter(cls.policy_aliases))
         default: type[KNNPolicy] = cls.policy_aliases[name]  # type: ignore[assignment]
         call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{name}", env)'
@@ -204,16 +204,16 @@ class KNNAlgorithm(OnlineAlgorithm):
 
     @classmethod
     def _check_environment(cls, given: Any) -> None:
-        """Refuse what is near to an environment."""
+        """Refuse classes of environments, and environments of gymnasium.vector."""
         if isinstance(given, type) and issubclass(given, (gym.Env, gym.vector.VectorEnv, VecEnv)):
             raise ValueError(
-                f"env must be an environment; got the class {given.__name__}. Make one of it: "
+                f"env must be an environment; got the class {given.__name__}. Make an instance: "
                 f"{cls.__name__}({given.__name__}(...))"
             )
         if isinstance(given, gym.vector.VectorEnv):
             raise ValueError(
-                f"{cls.__name__} takes SB3's VecEnv, and environments of gymnasium.vector are none; got {given!r}. In "
-                "place of gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
+                f"{cls.__name__} takes SB3's VecEnv, not environments of gymnasium.vector; got {given!r}. Instead of "
+                "gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
             )
 
     @classmethod
@@ -343,10 +343,10 @@ class KNNAlgorithm(OnlineAlgorithm):
         """
         Set the environment to learn from.
 
-        :param env: one of the same spaces, and as many if it is a VecEnv
+        :param env: an environment with the same spaces, or a VecEnv with the same number of environments
         :param force_reset: whether ``learn`` starts new episodes
-        :raises ValueError: if it is a class or of gymnasium.vector; if its observations are normalised (VecNormalize)
-            and those that the model was made for are not, or the other way round; as in SB3, if its spaces differ
+        :raises ValueError: if it is a class or an environment of gymnasium.vector; if only one of this environment and
+            the one that the model was made with normalises observations (VecNormalize); as in SB3, if its spaces differ
         """
         self._check_environment(env)
         self._check_normalization(env)
@@ -356,35 +356,35 @@ class KNNAlgorithm(OnlineAlgorithm):
         normalized = normalizes_observations(env)
         if normalized and not self._normalized:
             raise ValueError(
-                "env normalises observations (VecNormalize), and the points of this model were laid for observations "
-                f"as they are. Make a model with it, {type(self).__name__}(VecNormalize(env)), or leave observations "
-                "as they are, VecNormalize(env, norm_obs=False)"
+                "env normalises observations (VecNormalize), but the points of this model were placed for unnormalised "
+                f"observations. Make a new model, {type(self).__name__}(VecNormalize(env)), or do not normalise "
+                "observations, VecNormalize(env, norm_obs=False)"
             )
         if self._normalized and not normalized:
             raise ValueError(
-                "the points of this model were laid for normalised observations (VecNormalize), and env does not "
-                "normalise them. Wrap it with what was known of them: VecNormalize.load(path, env)"
+                "the points of this model were placed for normalised observations (VecNormalize), but env does not "
+                "normalise them. Wrap it with the saved statistics: VecNormalize.load(path, env)"
             )
 
     def _warn_of_overshooting(self) -> None:
-        """Of step sizes that carry a value beyond what it is moved towards."""
+        """Warn if the learning rate is so large that updates overshoot their targets."""
         highest = max(self.lr_schedule(progress) for progress in PROGRESS)
-        # An update removes the share α of the TD error if it is normalised, otherwise α Σp², which is α/k at least.
+        # An update removes the share α of the TD error if it is normalised, otherwise α Σp², which is at least α/k.
         most = 1 if self.step_size == "normalized" else self.policy.n_neighbors
         if highest > most:
             warnings.warn(
-                f"learning_rate={highest:g} with step_size={self.step_size!r} moves values beyond what they are "
-                f"learned from, and they may diverge: give at most {most}",
+                f"learning_rate={highest:g} with step_size={self.step_size!r} moves values beyond their targets, and "
+                f"they may diverge: use at most {most}",
                 stacklevel=4,
             )
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
-        Seed Python, NumPy, torch, the environment, the action space, and the learner's own numbers.
+        Seed Python, NumPy, torch, the environment, the action space, and the learner's random numbers.
 
-        :param seed: the seed, from 0 to 2³² - 1; ``None`` leaves all but the learner's own as they are, which start
-            anew from the operating system's entropy
-        :raises ValueError: if it is no such number
+        :param seed: the seed, from 0 to 2³² - 1; ``None`` seeds only the learner's random numbers, from the operating
+            system's entropy
+        :raises ValueError: if it is out of range
         """
         if seed is not None:
             seed = check_integer("seed", seed, 0, LARGEST_SEED)
@@ -400,14 +400,14 @@ class KNNAlgorithm(OnlineAlgorithm):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        The action the table recommends, ties to the lowest; or, if not deterministic, one from the exploration
-        policy at its present rate.
+        The greedy action, the lowest one of equal actions; or, if not deterministic, an action of the exploration
+        policy at its current rate.
 
         :param observation: one observation, or a batch, observation units
-        :param state: handed back, a table has none
+        :param state: has no effect and is returned
         :param episode_start: has no effect
-        :param deterministic: whether to leave out exploration
-        :return: action, or a batch of them, and ``state``
+        :param deterministic: whether to act greedily
+        :return: action, or a batch of actions, and ``state``
         """
         greedy, state = self.policy.predict(observation, state, episode_start, deterministic)
         if deterministic:
@@ -434,9 +434,9 @@ class KNNAlgorithm(OnlineAlgorithm):
         answer = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self.learner.table is not self.policy.table:
             raise ValueError(
-                "model.policy has been replaced, and what is learned would go to the one that the model was made with. "
-                "Leave that one, and have it take over what the other has learned: "
-                "model.policy.load_state_dict(other.state_dict()), with the points, bounds and dtype of the other"
+                "model.policy has been replaced, but the learner updates the policy that the model was made with. Keep "
+                "that policy and load the other one's state: model.policy.load_state_dict(other.state_dict()); both "
+                "must have the same points, bounds and dtype"
             )
         self._measuring = self._must_measure()
         return answer
@@ -470,7 +470,7 @@ class KNNAlgorithm(OnlineAlgorithm):
         return Rates(self.lr_schedule(progress), self.trace_schedule(progress), exploration)
 
     def _truncated(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, np.ndarray]:
-        """The last observations of the episodes that a time limit ended. All that ended are checked."""
+        """The last observations of truncated episodes, by environment. Those of all ended episodes are checked."""
         assert self._step_check is not None
         truncated = {}
         for env in np.flatnonzero(dones).tolist():
@@ -502,7 +502,7 @@ class KNNAlgorithm(OnlineAlgorithm):
             self._tell_range(f"measured over {self._n_measured} random steps")
 
     def _widen(self, observations: np.ndarray) -> None:
-        """Take in the last observations, and begin anew from there."""
+        """Widen the bounds to include the last observations, and restart the learner's episodes there."""
         self.policy.widen(th.from_numpy(observations).to(self.device))
         self._abandon_episodes()
         self._tell_range(f"widened at step {self.num_timesteps}")
@@ -542,17 +542,17 @@ class KNNAlgorithm(OnlineAlgorithm):
         include: Iterable[str] | None = None,
     ) -> None:
         """
-        Save everything to a zip file, table, traces, random state and counters. It is written beside the old
-        file and renamed, so that whatever interrupts it leaves a whole file.
+        Save the complete state to a zip file: table, traces, random state and counters. The file is written atomically:
+        an interruption leaves the old file.
 
         :param path: file, with ``.zip`` added if it has no suffix, or file-like object
-        :param exclude: attributes to leave out besides SB3's
-        :param include: attributes to save although SB3 leaves them out
+        :param exclude: attributes to exclude in addition to SB3's
+        :param include: attributes to save although SB3 excludes them
         """
         self._stream_states = [self._stream.state(), self._prediction_stream.state()]
         shown, in_episodes = self._last_obs, self.learner.in_episodes
         if self._acted_on is not None:
-            # A callback saves: its file goes on where the next step does.
+            # Called by a callback: the saved model must continue with the next step.
             self._move_on()
         try:
             if not isinstance(path, (str, pathlib.Path)):
@@ -568,7 +568,7 @@ class KNNAlgorithm(OnlineAlgorithm):
             self._last_obs, self.learner.in_episodes = shown, in_episodes
 
     def _save(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
-        """Save to an open file, and beside what SB3 pickles there the same as data, for :meth:`load` without trust."""
+        """Save to an open file, and add the pickled objects as data, for :meth:`load` with ``trusted=False``."""
         left_out = {*self._excluded_save_params(), *(exclude or ())} - set(include or ())
         values = {name: value for name, value in vars(self).items() if name not in left_out}
         self.plain = encodable({name: value for name, value in values.items() if not is_json_serializable(value)})
@@ -592,22 +592,23 @@ class KNNAlgorithm(OnlineAlgorithm):
         """
         Load a model from a zip file.
 
-        SB3's format has pickled objects in it, and to read them is to run what the file says: by default a file is
-        trusted as a program is. With ``trusted=False`` nothing is unpickled; spaces, schedules of SB3, arrays and
-        numbers are read as data, which :meth:`save` has stored beside.
+        SB3's format contains pickled objects, and unpickling executes code from the file, so load only files from
+        sources that you trust. With ``trusted=False`` nothing is unpickled: spaces, SB3's schedules, arrays and numbers
+        are read from the data that :meth:`save` adds to the file.
 
         :param path: file, or file-like object
-        :param env: environment to go on with; ``None`` to predict only. Its number may differ from the saved
-        :param device: where perception and table are to be
-        :param custom_objects: objects to take in place of those in the file
-        :param print_system_info: whether to print the system it was saved on
-        :param force_reset: whether ``learn`` starts new episodes; ``False`` goes on in the middle of the saved
-            ones, for an environment that is in the state it was in
-        :param trusted: whether to unpickle what the file holds; ``False`` for files of others
-        :param kwargs: attributes to change; with ``seed`` the random numbers begin anew
+        :param env: environment to continue with, ``None`` to predict only. The number of environments may differ from
+            the saved one
+        :param device: device of the perception and the table
+        :param custom_objects: objects that replace those in the file
+        :param print_system_info: whether to print information on the system that the model was saved on
+        :param force_reset: whether ``learn`` starts new episodes; with ``False`` it continues the saved episodes, for
+            an environment that is still in the saved state
+        :param trusted: whether to unpickle objects; use ``False`` for files from others
+        :param kwargs: attributes to change; with ``seed``, new sequences of random numbers are started
         :return: the model
-        :raises ValueError: if the file is damaged, of another algorithm, or of other spaces than ``env`` has; without
-            trust also if it holds functions or other objects that are there only as pickles
+        :raises ValueError: if the file is damaged, the algorithm or the spaces of ``env`` differ, or, with
+            ``trusted=False``, the file holds functions or other objects only as pickles
         """
         cls._check_environment(env)
         saved = read_description(path)
@@ -620,12 +621,12 @@ class KNNAlgorithm(OnlineAlgorithm):
             custom_objects = objects_for(path, saved, custom_objects or {}) | (custom_objects or {})
         try:
             model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except (RuntimeError, pickle.UnpicklingError, KeyError) as error:  # of a state that does not fit
-            # SB3 takes a ValueError for that of an old file of DQN, and looks in vain for an optimizer.
+        except (RuntimeError, pickle.UnpicklingError, KeyError) as error:  # the state does not fit
+            # SB3 handles a ValueError as if from an old file of DQN, and then raises KeyError for a missing optimizer.
             cause = error.__context__ if isinstance(error, KeyError) and error.__context__ else error
             raise ValueError(f"{path}: {cause}") from cause
         vars(model).pop("plain", None)
-        # Files of the first version have the next actions here, or None where new episodes were to begin.
+        # Files of the first version store the next actions here, or None if new episodes were to start.
         if vars(model).pop("_last_actions", ...) is None:
             model.learner.abandon_episodes()
         if env is not None:
@@ -636,7 +637,7 @@ class KNNAlgorithm(OnlineAlgorithm):
             shape = (model.n_envs, *(model.observation_space.shape or ()))
             if getattr(model._last_obs, "shape", None) != shape:
                 raise ValueError(f"{path}: the last observations must have shape {shape}; got {model._last_obs!r:.200}")
-        # A seed that is given begins new sequences; without one the saved ones go on.
+        # A given seed starts new sequences; otherwise the saved ones continue.
         if kwargs.get("seed") is None:
             for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
                 stream.set_state(state)
@@ -646,7 +647,7 @@ class KNNAlgorithm(OnlineAlgorithm):
 def normalizes_observations(env: GymEnv | None) -> bool:
     """
     :param env: an environment, VecEnv or not
-    :return: whether it is in a VecNormalize that changes observations
+    :return: whether it is wrapped in a VecNormalize that normalises observations
     """
     normalizer = unwrap_vec_normalize(env)  # type: ignore[arg-type]
     return normalizer is not None and normalizer.norm_obs
@@ -654,15 +655,15 @@ def normalizes_observations(env: GymEnv | None) -> bool:
 
 def check_device(device: Any) -> th.device:
     """
-    :param device: what was given
-    :return: the device it means; the CPU for CUDA where there is none, as in SB3
-    :raises ValueError: if there is no such device, or it cannot hold a table
+    :param device: the given value
+    :return: the device; as in SB3, the CPU if CUDA is not available
+    :raises ValueError: if there is no such device, or it does not support float64
     """
     error: Exception | None = None
     if isinstance(device, (str, th.device)):
         try:
             found = get_device(device)
-            # Some devices hold no float64, and some nothing at all.
+            # Some devices do not support float64, and some cannot store tensors at all.
             th.zeros(1, dtype=th.float64, device=found).item()
         except (AssertionError, RuntimeError, TypeError, ValueError) as raised:
             error = raised

@@ -18,10 +18,10 @@ from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.kernels.selection import Exploration
 from sb3_knntd.policies import ExAPolicy
 
-#: ``exploration_hold="auto"``: what share of an episode. A pole falls within fifty steps if something is tried for
-#: longer, and a car leaves no valley on less.
+#: ``exploration_hold="auto"``: share of an episode. If draws are kept for longer, a pole falls within fifty steps; if
+#: they are kept for less, a car does not leave its valley.
 AUTO_HOLD = 1 / 50
-#: For how many steps a draw can be held: the random numbers that end it are multiples of 2^-53.
+#: Upper limit of the mean number of steps for which a draw is kept: random numbers are multiples of 2^-53.
 LONGEST_HOLD = 1e15
 
 SelfExA = TypeVar("SelfExA", bound="ExA")
@@ -29,11 +29,11 @@ SelfExA = TypeVar("SelfExA", bound="ExA")
 
 class ExA(KNNAlgorithm):
     """
-    Ex⟨a⟩(λ): each of the k nearest points recommends the best of a few action points, and the action is the mean of
-    what they recommend, weighted as the observation is (Algorithm 4 of the paper). With ``trace_decay=0`` it is Ex⟨a⟩.
+    Ex⟨a⟩(λ): each of the k nearest points selects the best of a few action points, and the action is their mean,
+    weighted by the probabilities of the neighbours (Algorithm 4 of the paper). With ``trace_decay=0`` it is Ex⟨a⟩.
 
-    The TD error is r + γ Σ p'(i) max Q(i, ·) - Σ p(i) max Q(i, ·) (eqs. 24 and 25), also where something is explored:
-    the entries that were tried are moved by how much better or worse things went than the best ones promised.
+    The TD error is r + γ Σ p'(i) max Q(i, ·) - Σ p(i) max Q(i, ·) (eqs. 24 and 25), also for exploratory actions: the
+    selected entries change by the difference between the observed return and the value of the best entries.
 
     .. code-block:: python
 
@@ -42,22 +42,22 @@ class ExA(KNNAlgorithm):
     Parameters not named here are those of :class:`~sb3_knntd.KNNTD`; the learning rate falls from 0.7 to 0.05 by
     default.
 
-    :param policy: the environment, as there is no policy to choose; or, in SB3's order, ``"KNNPolicy"``
+    :param policy: the environment, since there is only one policy; or, in SB3's order, ``"KNNPolicy"``
     :param env: the environment: a gymnasium id, an environment, or a VecEnv
-    :param action_points: the list A of eq. 19: an int >= 2 or one int a dimension for evenly spaced points over the
-        action space, or rising arrays, one a dimension, in action units. Few points learn faster: what lies between
-        them is reached by averaging
+    :param action_points: the list A of eq. 19: an int >= 2 or one int per dimension for evenly spaced points over the
+        action space, or one ascending array per dimension, in action units. Fewer points learn faster: actions between
+        them are reached by averaging
     :param action_table: for several action dimensions: ``"joint"``, a column for every combination of their points;
-        ``"factored"``, columns for each dimension by itself, each with its own greedy index and one TD error for all;
+        ``"factored"``, separate columns for each dimension, each with its own greedy index and one TD error for all;
         ``None`` is joint up to 128 combinations
-    :param exploration: ``"shared"``: one column for all neighbours, held for some steps; ``"per_neighbor"`` (eq. 27):
-        one for each, which averages itself away as k grows
+    :param exploration: ``"shared"``: one random column for all neighbours, kept for several steps; ``"per_neighbor"``
+        (eq. 27): one for each neighbour; its effect averages out as k grows
     :param exploration_initial_eps: ε at the start, in [0, 1]: with ``"shared"`` the share of the time spent exploring
     :param exploration_final_eps: ε at the end, in [0, 1]
     :param exploration_fraction: share of the training over which ε changes, in (0, 1]
-    :param exploration_hold: for how many steps in the mean, in [1, 1e15], a shared draw of whether and what to explore
-        is held; ``"auto"`` is a fiftieth of an episode, as long as episodes are at present
-    :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
+    :param exploration_hold: mean number of steps, in [1, 1e15], for which a shared draw (whether to explore, and which
+        column) is kept; ``"auto"`` is a fiftieth of the current mean length of an episode
+    :raises ValueError: if an argument is invalid; the message names it, the given value and what is valid
     """
 
     policy: ExAPolicy
@@ -140,7 +140,7 @@ class ExA(KNNAlgorithm):
     @classmethod
     def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         super()._check_spaces(observation_space, action_space)
-        # SB3 asserts it; here it gets a message that says what to do.
+        # SB3 only asserts it, without advice.
         if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
             raise ValueError(
                 f"{cls.__name__} takes actions in a Box with finite bounds; got {action_space}. Bound it by a "
@@ -163,7 +163,7 @@ class ExA(KNNAlgorithm):
         )
 
     def _persistence(self) -> tuple[float, float]:
-        """For how many steps a draw is kept at least, and for what share of an episode."""
+        """Lower limit of the mean number of steps for which a draw is kept, and share of an episode."""
         if not isinstance(self.exploration_hold, str):
             return check_number("exploration_hold", self.exploration_hold, 1.0, LONGEST_HOLD), 0.0
         if self.exploration_hold != "auto":

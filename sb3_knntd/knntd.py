@@ -24,40 +24,40 @@ SelfKNNTD = TypeVar("SelfKNNTD", bound="KNNTD")
 
 class KNNTD(KNNAlgorithm):
     """
-    kNN-TD(λ): SARSA(λ) or Q(λ) over a table of action values at points of the observation space, each observation
-    being a weighted mean of its k nearest points.
+    kNN-TD(λ): SARSA(λ) or Q(λ) with a table of action values at points of the observation space. The values of an
+    observation are a weighted mean over its k nearest points.
 
     Paper: Martin H., de Lope, Maravall, "Robust high performance reinforcement learning through weighted k-nearest
     neighbors", Neurocomputing 74 (2011), https://doi.org/10.1016/j.neucom.2010.07.027. With ``trace_decay=0`` it is
-    kNN-TD (Algorithm 2), with ``n_neighbors=1`` besides NN-TD (Algorithm 1). On Discrete, MultiDiscrete
-    and MultiBinary observations it is exact tabular SARSA(λ) or Q(λ).
+    kNN-TD (Algorithm 2), with ``n_neighbors=1`` in addition NN-TD (Algorithm 1). On Discrete, MultiDiscrete and
+    MultiBinary observations it is exact tabular SARSA(λ) or Q(λ).
 
     .. code-block:: python
 
         model = KNNTD("MountainCar-v0", seed=0).learn(20_000)
-        model.policy.q_table  # what it learned, at model.policy.points
+        model.policy.q_table  # the action values at model.policy.points
 
-    :param policy: the environment, as there is no policy to choose; or, in SB3's order, ``"KNNPolicy"`` or a subclass
-        of :class:`~sb3_knntd.KNNPolicy`
+    :param policy: the environment, since there is only one policy; or, in SB3's order, ``"KNNPolicy"`` or a subclass of
+        :class:`~sb3_knntd.KNNPolicy`
     :param env: the environment: a gymnasium id, an environment, or a VecEnv
-    :param learning_rate: α >= 0; or a function of the remaining progress (from 1 to 0); or a word for one that changes
-        linearly over the whole training: ``"lin_0.5_0.05"`` falls from 0.5 to 0.05, ``"lin_0.5"`` to 0
+    :param learning_rate: α >= 0; or a function of the remaining progress (from 1 to 0); or a string for a linear
+        schedule over the whole training: ``"lin_0.5_0.05"`` falls from 0.5 to 0.05, ``"lin_0.5"`` falls to 0
     :param gamma: γ, in [0, 1]
-    :param trace_decay: λ, in [0, 1], or a function or word as for ``learning_rate``
+    :param trace_decay: λ, in [0, 1], or a function or string as for ``learning_rate``
     :param n_neighbors: k >= 1; ``"auto"`` is 2 obs_dim + 1, a point and its neighbours along each axis, and 1 on
         Discrete, MultiDiscrete and MultiBinary observations
-    :param points: the perception points: an int or one int a dimension for a lattice over the bounds, or an array
+    :param points: the perception points: an int or one int per dimension for a lattice over the bounds, or an array
         (n_points, obs_dim) in observation units for scattered points; ``"auto"`` is a lattice of about 8000 points,
-        at most 20 in a dimension, or one point a state on Discrete, MultiDiscrete and MultiBinary ones
+        at most 20 per dimension, or one point per state on Discrete, MultiDiscrete and MultiBinary observations
     :param bounds: the range mapped to [-1, 1]: (low, high), arrays (obs_dim,) in observation units; ``None`` takes the
-        space's, and finds a range for every dimension that has none in a random phase at the start of :meth:`learn`;
-        ``"adaptive"`` finds one for every dimension there, and widens it whenever an observation lies beyond, carrying
-        the values over to where a lattice's points then are and letting go the traces
+        bounds of the space, and measures the range of unbounded dimensions in a random phase at the start of
+        :meth:`learn`; ``"adaptive"`` measures the range of every dimension, and widens it whenever an observation lies
+        outside: the values are then carried over to the new points of the lattice, and traces are dropped
     :param weights: ``"inverse_quadratic"``: 1 / (1 + d²/h²), eq. 5; ``"gaussian"``: exp(-d²/2h²); or a function from
         squared distances (batch, k), scaled units, to weights (batch, k), both torch tensors
-    :param bandwidth: h of the weights, >= 1e-100, scaled units (the bounds are 2 wide)
-    :param search: how neighbours are found, all exactly but ``"hnsw"``: ``"brute"``, ``"lattice"``, ``"kd_tree"``,
-        ``"hnsw"`` (approximate, extra ``[ann]``), or ``"auto"``
+    :param bandwidth: h of the weights, >= 1e-100, scaled units (the range of each dimension has width 2)
+    :param search: how neighbours are found: ``"brute"``, ``"lattice"``, ``"kd_tree"`` (all exact), ``"hnsw"``
+        (approximate, extra ``[ann]``), or ``"auto"`` (exact)
     :param step_size: ``"paper"`` for α as in eq. 13, ``"normalized"`` for α / Σp², which makes α the share of the TD
         error that one update removes
     :param traces: ``"replacing"`` (eq. 16) or ``"accumulating"`` (eq. 15)
@@ -69,18 +69,18 @@ class KNNTD(KNNAlgorithm):
     :param exploration_initial_eps: ε at the start, in [0, 1]
     :param exploration_final_eps: ε at the end, in [0, 1]
     :param exploration_fraction: share of the training over which ε changes, in (0, 1]
-    :param temperature: of softmax, >= 1e-100, in units of return, or a function or word as for ``learning_rate``
-    :param tie_break: which of several equal best actions is taken while training: ``"random"`` or ``"first"``
-    :param initial_value: Q at the start, up to ±1e30; above what is attainable it makes the learner explore
-    :param stats_window_size: number >= 1 of episodes that the logged means are over
+    :param temperature: of softmax, >= 1e-100, in units of return, or a function or string as for ``learning_rate``
+    :param tie_break: how ties between best actions are broken while training: ``"random"`` or ``"first"``
+    :param initial_value: initial Q, up to ±1e30; values above the attainable return make the learner explore
+    :param stats_window_size: number of episodes, >= 1, over which logged means are taken
     :param tensorboard_log: folder for TensorBoard, ``None`` for no log
     :param policy_kwargs: ``dtype`` (``torch.float64`` or ``torch.float32``), ``table`` (``"auto"``, ``"dense"``,
         ``"hashed"``) and ``compiled`` (``False`` for the torch reference), see :class:`~sb3_knntd.KNNPolicy`
     :param verbose: 0 for no output, 1 for information, 2 for debugging
     :param seed: seed of all random numbers, from 0 to 2³² - 1
-    :param device: where perception and table are; on the CPU the step is compiled
+    :param device: device of the perception and the table; on the CPU the step is compiled
     :param _init_setup_model: whether to build the table at once
-    :raises ValueError: if an argument does not fit; the message says which, what was given, and what would do
+    :raises ValueError: if an argument is invalid; the message names it, the given value and what is valid
     """
 
     target: Any = Hyperparameter()

@@ -1,4 +1,4 @@
-"""The online loop: SB3 algorithms that learn from each step when it is made."""
+"""The online training loop: base class of SB3 algorithms that learn from each step at once."""
 
 from __future__ import annotations
 
@@ -24,43 +24,43 @@ SelfOnlineAlgorithm = TypeVar("SelfOnlineAlgorithm", bound="OnlineAlgorithm")
 
 class OnlineAlgorithm(BaseAlgorithm):
     """
-    Acts and learns one step at a time. A subclass says how, by :meth:`_act` and :meth:`_learn_from`.
+    Acts and learns one step at a time. Subclasses implement :meth:`_act` and :meth:`_learn_from`.
 
-    The parameters are SB3's.
+    The parameters are those of SB3's BaseAlgorithm.
     """
 
-    # What the last step led to, and while callbacks run the observation that was acted on.
+    # The observations after the last step; and, while callbacks run, those before it.
     _standing: Any = None
     _acted_on: Any = None
     _step_check: StepCheck | None = None
 
     @abstractmethod
     def _act(self) -> np.ndarray:
-        """The next actions, as the environments take them, shape (n_envs, *action_shape)."""
+        """The next actions of the environments, shape (n_envs, *action_shape)."""
 
     def _learn_from(
         self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
         """
-        Learn from the step that the last actions led to.
+        Learn from the last step.
 
-        :param new_obs: the present observations, after a reset where an episode ended, shape (n_envs, *obs_shape)
+        :param new_obs: the current observations, after a reset where an episode ended, shape (n_envs, *obs_shape)
         :param rewards: shape (n_envs,)
         :param dones: whether episodes have ended, shape (n_envs,), bool
         :param infos: one for each environment
-        :raises ValueError: if they are not what they must be; nothing has been learned then
-        :raises FloatingPointError: if what is learned would diverge; nothing has been learned then
+        :raises ValueError: if an argument is invalid; nothing has been learned
+        :raises FloatingPointError: if values would diverge; nothing has been learned
         """
 
     def _abandon_episodes(self) -> None:
-        """The environments are about to begin elsewhere: forget the actions selected for where they are."""
+        """Forget the current episodes and selected actions: the environments have changed state or will be reset."""
 
     def _checks_steps(self) -> bool:
-        """Whether observations are arrays of the shape of the observation space, and are checked to be so."""
+        """Whether to check that observations are arrays of the shape of the observation space."""
         return True
 
     def _log(self) -> Mapping[str, float]:
-        """What to log besides SB3's keys."""
+        """Values to log in addition to SB3's."""
         return {}
 
     def learn(
@@ -73,19 +73,19 @@ class OnlineAlgorithm(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> SelfOnlineAlgorithm:
         """
-        Learn from ``total_timesteps`` steps in the environment, from each in the step that made it.
+        Train for ``total_timesteps`` steps, learning from each step as it is made.
 
-        :param total_timesteps: number of environment steps, over all environments together
-        :param callback: called at every step, after it has been learned from
-        :param log_interval: number of episodes between logs, ``None`` for none
+        :param total_timesteps: total number of steps over all environments
+        :param callback: called at every step, after learning from it
+        :param log_interval: number of episodes between logs, ``None`` for no logs
         :param tb_log_name: name of the run in TensorBoard
-        :param reset_num_timesteps: whether to count steps from 0; if not, training goes on where it was
+        :param reset_num_timesteps: whether to count steps from 0; otherwise training continues
         :param progress_bar: whether to show a progress bar (tqdm and rich)
         :return: the model
-        :raises ValueError: if ``total_timesteps`` is no number, or an environment returns an array of another shape or
-            a value that is not finite. Nothing is learned from that step
+        :raises ValueError: if ``total_timesteps`` is no number, or an environment returns an array of the wrong shape
+            or a value that is not finite; nothing is learned from that step
         """
-        # As SB3, which takes 1e6 as well, and does nothing for numbers below 1; but NaN would be no steps, unnoticed.
+        # Like SB3, accept floats such as 1e6, and numbers below 1 (no steps). NaN would silently mean no steps.
         check_number("total_timesteps", total_timesteps)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
@@ -126,11 +126,11 @@ class OnlineAlgorithm(BaseAlgorithm):
 
     def _step(self, dispatcher: CallbackDispatcher, log_interval: int | None) -> bool:
         """
-        One step in every environment, and what is learned from it.
+        Make one step in every environment, and learn from it.
 
         :param dispatcher: calls the callbacks
         :param log_interval: number of episodes between logs
-        :return: whether to go on
+        :return: whether training continues
         """
         env = self.env
         assert env is not None
@@ -150,7 +150,7 @@ class OnlineAlgorithm(BaseAlgorithm):
             self._learn_from(new_obs, rewards, dones, infos)  # type: ignore[arg-type]
         except BaseException as error:
             step, self.num_timesteps = max(self.num_timesteps, n_before + env.num_envs), n_before
-            # What was going on in the environments is lost with this step: to go on is to begin anew.
+            # The state of the environments is unknown now: the next call of learn must reset them.
             self._last_obs = None
             self._abandon_episodes()
             if type(error) in (ValueError, FloatingPointError):
@@ -163,7 +163,7 @@ class OnlineAlgorithm(BaseAlgorithm):
         if not any_ended and any("episode" in info for info in infos):
             self._update_info_buffer(infos, dones)
 
-        # Observations are handed on and not copied: SB3's algorithms keep what a VecEnv returned as well.
+        # Observations are not copied: SB3's algorithms also keep the arrays that a VecEnv returned.
         if dispatcher.callbacks and dispatcher.record_step(new_obs, any_ended):  # type: ignore[arg-type]
             self._acted_on = last_obs
             try:
@@ -182,7 +182,7 @@ class OnlineAlgorithm(BaseAlgorithm):
         return True
 
     def _follow_callback(self) -> Any:
-        """Begin where a callback has moved the environments, or reset those that it has set; the observations there."""
+        """Start new episodes where a callback has moved the environments, or reset new ones; the observations."""
         self._abandon_episodes()
         if self._last_obs is None:
             assert self.env is not None
@@ -192,7 +192,7 @@ class OnlineAlgorithm(BaseAlgorithm):
         return self._last_obs
 
     def _move_on(self) -> None:
-        """Be where the step led, or where a callback says that the environments are: episodes begin there."""
+        """Set the last observations to those after the step, unless a callback has set them: then forget episodes."""
         if self._last_obs is self._acted_on:
             self._last_obs = self._standing
         else:
@@ -201,14 +201,14 @@ class OnlineAlgorithm(BaseAlgorithm):
     def _count_episodes(
         self, ended: list[bool], infos: list[dict[str, Any]], dones: np.ndarray, log_interval: int | None
     ) -> int:
-        """Count the episodes that ended; how often a log is due."""
+        """Count the episodes that ended; the number of logs that are due."""
         self._update_info_buffer(infos, dones)
         before = self._episode_num
         self._episode_num += ended.count(True)
         return self._episode_num // log_interval - before // log_interval if log_interval else 0
 
     def dump_logs(self) -> None:
-        """Write the log, under SB3's keys and the algorithm's own."""
+        """Write the log, with SB3's keys and those of the algorithm."""
         assert self.ep_info_buffer is not None
         assert self.ep_success_buffer is not None
         elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)

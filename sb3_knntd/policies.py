@@ -1,4 +1,4 @@
-"""The policy: perception and table, and the action they recommend."""
+"""The policies: perception, Q-table and action selection."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ from sb3_knntd.perception.search import SEARCHES
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.q_table import DenseTable, HashedTable, QTable
 
-#: ``table="auto"``: a lattice whose dense table would take more bytes than this gets a hashed one.
+#: ``table="auto"``: maximum size of a dense table of a lattice, bytes; larger tables are hashed.
 DENSE_TABLE_BYTES = 2**28
 
 
 class KNNPolicy(BasePolicy):
     """
-    A table of action values at points of the observation space, read as a weighted mean over the k nearest.
+    A table of action values at points of the observation space, read as a weighted mean over the k nearest points.
 
     :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param action_space: Discrete
-    :param lr_schedule: not used, there is nothing to optimise; part of SB3's signature
+    :param lr_schedule: has no effect, part of SB3's signature
     :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for all but a Box
-    :param points: ``"auto"``, an int, one int a dimension, or an array (n_points, obs_dim) in observation units
+    :param points: ``"auto"``, an int, one int per dimension, or an array (n_points, obs_dim) in observation units
     :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
         weights (batch, k)
     :param bandwidth: h of the weights, scaled units
-    :param search: how neighbours are found
-    :param initial_value: what every entry of the table is at the start
+    :param search: how neighbours are found, see :class:`~sb3_knntd.KNNTD`
+    :param initial_value: initial value of all entries of the table
     :param dtype: floating type of the table, ``torch.float64`` or ``torch.float32``
-    :param table: ``"dense"`` (a row for every point), ``"hashed"`` (a row for every point visited, for lattices
-        larger than memory, on the CPU), or ``"auto"``: dense up to 256 MiB
-    :param compiled: whether to use the compiled step where it can be used: on the CPU, with numba, and with
-        weights that are no function
-    :param columns: what each column of the table stands for; by default one of the Discrete actions
-    :param bounds_from_space: whether the observation space tells the range of the observations
-    :raises ValueError: if an argument does not fit; the message says which, and what would
+    :param table: ``"dense"`` (a row for every point), ``"hashed"`` (a row for every visited point, for lattices larger
+        than memory, on the CPU), or ``"auto"``: dense up to 256 MiB
+    :param compiled: whether to use the compiled step if possible: on the CPU, with numba, and unless ``weights`` is a
+        function
+    :param bounds_from_space: whether the bounds of the observation space are the range of the observations
+    :param columns: the actions that the columns of the table stand for; by default the Discrete actions
+    :raises ValueError: if an argument is invalid; the message names it and says what is valid
     """
 
-    #: the action spaces that it is for
+    #: type of the supported action spaces
     acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
 
     def __init__(
@@ -97,13 +97,13 @@ class KNNPolicy(BasePolicy):
         self._compilable = compiled and jit.AVAILABLE and isinstance(self.perceiver.weights, KernelWeights)
         if compiled and not jit.AVAILABLE:
             warnings.warn(
-                f"numba cannot be used ({jit.REASON}): learning goes by torch operations, slower", stacklevel=2
+                f"numba cannot be used ({jit.REASON}): learning uses torch operations, which is slower", stacklevel=2
             )
-        #: what each column of the table stands for
+        #: the actions that the columns of the table stand for
         self.columns = self._default_columns() if columns is None else columns
         n_actions = int(self.columns.factors[-1])
         self.table = self._make_table(table, self.perceiver.points, n_actions, initial_value, dtype)
-        #: selects actions; the algorithm replaces it by one that explores
+        #: selects actions; the algorithm sets one that explores
         self.selector = self._greedy_selector()
         self._reader: GreedyReader | None = None
         check_size(
@@ -114,7 +114,7 @@ class KNNPolicy(BasePolicy):
 
     def _default_columns(self) -> ActionColumns:
         assert isinstance(self.action_space, spaces.Discrete)
-        # An array is added faster than a number.
+        # Adding an array is faster than adding a Python int.
         self._first_action = np.asarray(self.action_space.start)
         return discrete_columns(int(self.action_space.n))
 
@@ -153,7 +153,7 @@ class KNNPolicy(BasePolicy):
 
     @property
     def device(self) -> th.device:
-        """Where the table is."""
+        """Device of the table."""
         return self.table.values.device
 
     @property
@@ -164,9 +164,8 @@ class KNNPolicy(BasePolicy):
     @property
     def points(self) -> th.Tensor:
         """
-        The perception points, shape (n_points, obs_dim), observation units; with a hashed table those that
-        have been visited. Until ``learn`` has measured them, dimensions without a range of their own stand at
-        [-1, 1].
+        The perception points, shape (n_points, obs_dim), observation units; with a hashed table, only the visited
+        ones. The range of unbounded dimensions is [-1, 1] until ``learn`` has measured it.
         """
         bounds = self.perceiver.bounds
         return bounds.unscale(self.perceiver.points.coordinates(bounds, self.table.points()))
@@ -174,15 +173,15 @@ class KNNPolicy(BasePolicy):
     @property
     def q_table(self) -> th.Tensor:
         """
-        The action values at :attr:`points`, shape (n_points, n_actions). To set values while episodes go on use
+        The action values at :attr:`points`, shape (n_points, n_actions). To set values during training, use
         ``set_parameters``.
         """
         return self.table.entries()
 
     def widen(self, observations: th.Tensor) -> None:
         """
-        Widen adaptive bounds to take in these observations. Where points move, each is given the values that the
-        table had there; the learner has to begin anew.
+        Widen adaptive bounds to include these observations. If points move, each is set to the values that the table
+        had at its new position; the learner must then start new episodes.
 
         :param observations: shape (batch, *obs_shape), any number type, observation units
         """
@@ -199,10 +198,10 @@ class KNNPolicy(BasePolicy):
 
     def add_points(self, points: np.ndarray | th.Tensor) -> None:
         """
-        Add scattered points. Each is given the values that the table has there; traces are dropped.
+        Add scattered points. Each is set to the values that the table has at its position; traces are dropped.
 
         :param points: shape (n_new, obs_dim), observation units
-        :raises ValueError: if the points are a lattice, or the new ones do not fit
+        :raises ValueError: if the points of the policy are a lattice, or the new ones are invalid
         """
         values = self.q_values(points)
         with self.table.lock, interrupts_held():
@@ -212,7 +211,7 @@ class KNNPolicy(BasePolicy):
     def perceive(self, observation: np.ndarray | th.Tensor) -> Perception:
         """
         :param observation: one observation, or a batch, observation units
-        :return: its nearest points and how much each counts; one row for a single observation
+        :return: the nearest points and their probabilities; one row for a single observation
         """
         return self._perceive(self._to_tensor(observation))
 
@@ -226,16 +225,16 @@ class KNNPolicy(BasePolicy):
     def state_values(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         """
         :param observation: one observation, or a batch, observation units
-        :return: what the states are worth if the greedy action is taken: max Q(s, ·) (eq. 12), for Ex⟨a⟩
-            Σ p(i) max Q(i, ·) (eq. 25), shape (batch,)
+        :return: the values of the greedy actions: max Q(s, ·) (eq. 12), for Ex⟨a⟩ Σ p(i) max Q(i, ·) (eq. 25), shape
+            (batch,)
         """
         return self.selector.greedy_value(*self.perceived_rows(observation))
 
     def perceived_rows(self, observation: np.ndarray | th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param observation: one observation, or a batch, observation units
-        :return: the table's rows at its nearest points, shape (batch, k, n_actions), and how much each counts,
-            shape (batch, k)
+        :return: the rows of the table at the nearest points, shape (batch, k, n_actions), and the probabilities of the
+            points, shape (batch, k)
         """
         return self._rows(self._to_tensor(observation))
 
@@ -247,13 +246,13 @@ class KNNPolicy(BasePolicy):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
-        The table's recommendation, ties to the lowest action.
+        The greedy action, the lowest one of equal actions.
 
         :param observation: one observation, or a batch, observation units
-        :param state: handed back, a table has none
+        :param state: has no effect and is returned
         :param episode_start: has no effect
-        :param deterministic: has no effect: no chance is involved
-        :return: action, or a batch of them, and ``state``
+        :param deterministic: has no effect, the policy is deterministic
+        :return: action, or a batch of actions, and ``state``
         """
         shape = self.observation_space.shape or ()
         array = observation if isinstance(observation, np.ndarray) else np.empty((0,) * (len(shape) + 2))
@@ -271,8 +270,8 @@ class KNNPolicy(BasePolicy):
 
     def fit_actions(self, actions: np.ndarray) -> np.ndarray:
         """
-        :param actions: numbers of actions from 0 on, shape (batch,)
-        :return: the same as the environment counts them, an array of its own
+        :param actions: indices of actions, counted from 0, shape (batch,)
+        :return: actions of the environment, counted from the start of its action space, a new array
         """
         fitting = actions.copy()
         if self._first_action:
@@ -282,21 +281,20 @@ class KNNPolicy(BasePolicy):
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
         """
         :param actions: actions of the environment, shape (batch, *action_shape)
-        :return: the columns of the table that stand for them, or come closest, one for each action factor, shape
-            (batch, n_factors), int64
+        :return: their columns of the table, one for each action factor, shape (batch, n_factors), int64
         :raises ValueError: if there is no such action
         """
         return self.selector.columns_of(np.asarray(actions) - self._first_action)
 
     def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
-        """Actions of the environment, (batch, *action_shape), from the columns that the neighbours select."""
+        """Actions of the environment, shape (batch, *action_shape), from the columns that the neighbours select."""
         return self.fit_actions(action_indices[:, 0, 0])
 
     def forward(self, observation: th.Tensor, deterministic: bool = True) -> th.Tensor:
         """
         :param observation: shape (batch, *obs_shape)
-        :param deterministic: has no effect: the table's recommendation involves no chance
-        :return: actions, shape (batch,)
+        :param deterministic: has no effect, the policy is deterministic
+        :return: actions, shape (batch, *action_shape)
         """
         return self._predict(observation, deterministic)
 
@@ -314,7 +312,7 @@ class KNNPolicy(BasePolicy):
         return tensor
 
     def _perceive(self, observations: th.Tensor) -> Perception:
-        # While torch records, there are no values to look at.
+        # Traced tensors have no values to check.
         if not is_traced() and not th.isfinite(observations).all():
             raise ValueError(f"observation must be finite; got {observations.tolist()}")
         perception: Perception = self.perceiver(observations)
@@ -325,7 +323,7 @@ class KNNPolicy(BasePolicy):
         return self.table.rows(perception.indices), perception.probabilities.to(self.table.values.dtype)
 
     def _exact_rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """The same in the arithmetic of the compiled search for the best entries, whatever type the table has."""
+        """Like :meth:`_rows` in float64 for every dtype of the table, as in the kernels."""
         perception = self._perceive(observations)
         return self.table.rows(perception.indices).double(), perception.probabilities
 
@@ -339,16 +337,16 @@ class KNNPolicy(BasePolicy):
             raise ValueError(f"the state of a policy must be a dict of tensors; got {str(state_dict)[:100]}")
         places = state_dict.get("perceiver.points.places")
         if isinstance(places, th.Tensor) and isinstance(self.table, DenseTable):
-            # Points may have been added to those that the policy was made with.
+            # Points may have been added since the policy was created.
             self.table.resize(len(places))
         answer = super().load_state_dict(state_dict, strict, assign)
-        # Saved bounds may differ from those of the space, where they were measured.
+        # Saved bounds may have been measured, and differ from the current ones.
         self.perceiver.fit()
         return answer
 
     def save(self, path: str) -> None:
         """
-        Save the policy, functions among its arguments as well.
+        Save the policy, including functions among its arguments.
 
         :param path: file, or file-like object
         """
@@ -364,16 +362,16 @@ class KNNPolicy(BasePolicy):
 
     def load_from_vector(self, vector: np.ndarray) -> None:
         """
-        Set the entries of :attr:`q_table`, also while episodes go on. A learner's traces are let go.
+        Set the entries of :attr:`q_table`, also during training. The learner's traces are dropped.
 
-        :param vector: what :meth:`parameters_to_vector` of a policy with the same points returned
-        :raises ValueError: if it has another length, or is not finite
+        :param vector: the return value of :meth:`parameters_to_vector` of a policy with the same points
+        :raises ValueError: if its length is wrong, or it is not finite
         """
         state = self.state_dict()
         values = th.as_tensor(vector, dtype=self.table.values.dtype)
         if values.shape != (self.q_table.numel(),):
             raise ValueError(
-                f"vector must have shape ({self.q_table.numel()},), a number for each entry of q_table; got "
+                f"vector must have shape ({self.q_table.numel()},), one number for each entry of q_table; got "
                 f"{tuple(values.shape)}"
             )
         if not th.isfinite(values).all():
@@ -390,15 +388,15 @@ class KNNPolicy(BasePolicy):
 
 class ExAPolicy(KNNPolicy):
     """
-    A table of the values of action points, of which each neighbour recommends its best, and the mean is taken.
+    A table of the values of action points. Each neighbour selects its best action point, and the action is their mean.
 
     :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param action_space: Box with finite bounds
-    :param lr_schedule: not used
+    :param lr_schedule: has no effect, part of SB3's signature
     :param action_points: see :class:`~sb3_knntd.ExA`
     :param action_table: see :class:`~sb3_knntd.ExA`
-    :param arguments: the others of :class:`KNNPolicy`
-    :raises ValueError: if an argument does not fit; the message says which, and what would
+    :param arguments: other arguments of :class:`KNNPolicy`
+    :raises ValueError: if an argument is invalid; the message names it and says what is valid
     """
 
     acts_in: ClassVar[type[spaces.Space[Any]]] = spaces.Box
@@ -418,9 +416,9 @@ class ExAPolicy(KNNPolicy):
         self._arguments |= {"action_points": action_points, "action_table": action_table}
         self._actions_are_whole = np.issubdtype(action_space.dtype, np.integer)
         self._action_type = action_space.dtype
-        # Of one dimension they have their shape already, and to ask costs as much as to convert them.
+        # One-dimensional actions need no reshaping, and looking up their shape takes as long as converting them.
         self._action_shape = None if len(action_space.shape) == 1 else (-1, *action_space.shape)
-        # A mean is beyond its terms by a float64's last digits at most, which float32 rounds away.
+        # Rounding can move a mean beyond its terms by a few units in the last place of a float64. In float32 it cannot.
         self._can_exceed = action_space.dtype != np.float32
         self._action_bounds = [th.from_numpy(bound) for bound in (action_space.low, action_space.high)]
 
@@ -432,7 +430,7 @@ class ExAPolicy(KNNPolicy):
     def fit_actions(self, actions: np.ndarray) -> np.ndarray:
         """
         :param actions: shape (batch, action_dim), action units
-        :return: the same as the environment takes them: in its shape and type, rounding kept within its bounds
+        :return: the same in the shape and dtype of the action space, rounded within its bounds
         """
         if self._actions_are_whole:
             actions = np.rint(actions)
@@ -448,9 +446,8 @@ class ExAPolicy(KNNPolicy):
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
         """
         :param actions: actions of the environment, shape (batch, *action_shape)
-        :return: the columns of the table that come closest to them, one for each action factor, shape (batch,
-            n_factors), int64
-        :raises ValueError: if an action is not finite, or has another shape
+        :return: the columns of the nearest action points, one for each action factor, shape (batch, n_factors), int64
+        :raises ValueError: if an action is not finite, or its shape is wrong
         """
         return self.selector.columns_of(np.asarray(actions).reshape(len(actions), -1))
 
@@ -465,7 +462,7 @@ class ExAPolicy(KNNPolicy):
         assert isinstance(observation, th.Tensor)
         rows, probabilities = self._exact_rows(observation)
         actions = self.selector.actions_of(self.selector.greedy_indices(rows, probabilities), probabilities)
-        # As fit_actions, in torch operations, so that it can be traced.
+        # Like fit_actions, but with torch operations that can be traced.
         if self._actions_are_whole:
             actions = actions.round()
         low, high = (bound.to(actions.device) for bound in self._action_bounds)

@@ -1,4 +1,4 @@
-"""The algorithms of this package, each stated once: what the command line, RL Zoo and comparisons know of them."""
+"""Registry of algorithms, used by the command line, RL Zoo and comparisons."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from gymnasium import spaces
 
 
 class Role(Enum):
-    """What an algorithm is for."""
+    """The role of an algorithm in this package."""
 
-    #: one that this package is for: offered by all commands
+    #: an algorithm of this package: available in all commands
     OWN = "own"
-    #: one to compare with: offered by ``compare``
+    #: an algorithm to compare with: available in ``compare``
     BASELINE = "baseline"
-    #: the least that any algorithm should reach: in every comparison
+    #: a lower limit of performance: included in every comparison
     FLOOR = "floor"
 
 
 @dataclass(frozen=True)
 class Algorithm:
     """
-    An algorithm. Classes are given by entry points, as in gymnasium's registry, and imported when they are asked for.
+    An algorithm. Its class is given by an entry point, as in gymnasium's registry, and imported on demand.
 
     :param name: its name on the command line
     :param entry_point: its class, ``"module:class"``
-    :param label: its name in tables and pictures
+    :param label: its name in tables and figures
     :param policy: name of its default policy
-    :param action_space: the type of action spaces that it takes
-    :param role: what it is for
-    :param description: what the help says of it besides its name; empty for nothing
-    :param config: file of its tuned settings in ``zoo_configs/``, in RL Zoo's form; ``None`` if it has none
+    :param action_space: type of the supported action spaces
+    :param role: its role in this package
+    :param description: additional text in the help; may be empty
+    :param config: file of its tuned hyperparameters in ``zoo_configs/``, in RL Zoo's format; ``None`` if it has none
     :param search_space: a :class:`~sb3_knntd.zoo.search_space.SearchSpace`, ``"module:name"``, for ``train --optimize``
         (extra ``[zoo]``); ``None`` if it has none
-    :raises ValueError: if it is one of this package's own, and has no tuned settings or no search space
+    :raises ValueError: if its role is ``OWN`` and ``config`` or ``search_space`` is missing
     """
 
     name: str
@@ -73,20 +73,20 @@ class Algorithm:
 
     @property
     def config_path(self) -> Path | None:
-        """Where its tuned settings are, ``None`` if it has none."""
+        """Path of its tuned hyperparameters, ``None`` if it has none."""
         return None if self.config is None else Path(str(files("sb3_knntd.zoo_configs") / self.config))
 
 
-#: All that are registered, by name, in the order in which they are shown.
+#: All registered algorithms by name, in display order.
 ALGORITHMS: dict[str, Algorithm] = {}
 
 
 def register(algorithm: Algorithm) -> None:
     """
-    Make an algorithm known to the command line, RL Zoo and comparisons.
+    Register an algorithm for the command line, RL Zoo and comparisons.
 
     :param algorithm: the algorithm
-    :raises ValueError: if there is another of its name
+    :raises ValueError: if an algorithm of this name is already registered
     """
     if algorithm.name in ALGORITHMS:
         raise ValueError(f"there is an algorithm {algorithm.name!r} already")
@@ -95,17 +95,17 @@ def register(algorithm: Algorithm) -> None:
 
 def with_role(*roles: Role) -> dict[str, Algorithm]:
     """
-    :param roles: one or several
-    :return: the algorithms of these roles, by name
+    :param roles: one or more roles
+    :return: the algorithms with these roles, by name
     """
     return {name: algorithm for name, algorithm in ALGORITHMS.items() if algorithm.role in roles}
 
 
 def for_actions(action_space: spaces.Space[Any]) -> Algorithm:
     """
-    :param action_space: of an environment
-    :return: the first algorithm of this package that takes such actions; if none does, the first of all, which says so
-        when it is made
+    :param action_space: action space of an environment
+    :return: the first algorithm of this package that supports the space; if none does, the first one, which raises an
+        error with advice when it is created
     """
     own = list(with_role(Role.OWN).values())
     return next((algorithm for algorithm in own if isinstance(action_space, algorithm.action_space)), own[0])
