@@ -1,4 +1,4 @@
-"""SB3 callbacks that show what a table has learned, and keep it safe."""
+"""SB3 callbacks that visualise the learned table and save checkpoints."""
 
 from __future__ import annotations
 

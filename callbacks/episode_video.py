@@ -1,4 +1,4 @@
-"""What the policy does, as a moving picture."""
+"""Videos of episodes."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from sb3_knntd.common.files import replace_file
 
 from .throttled import ThrottledCallback, picture_formats
 
-#: Frames a second at most: every frame of a faster environment would show nothing more.
+#: Maximum frame rate, frames per second; frames of faster environments are skipped.
 FRAMES_PER_SECOND = 25
-#: Pixels at most in width and height.
+#: Maximum width and height, pixels.
 LARGEST = 320
 
 
 class EpisodeVideoCallback(ThrottledCallback):
     """
-    Records an episode of the greedy policy when training ends, and before that every ``video_freq`` calls, as an
-    animated GIF: to TensorBoard's images under ``video/episode``, if the model logs there, and to ``folder``, if one is
-    given. (SB3's own ``Video`` needs moviepy below 2.)
+    Records an episode of the greedy policy every ``video_freq`` calls and at the end of training, as an animated GIF.
+    It is written to TensorBoard's images under ``video/episode`` if the model logs there, and to ``folder`` if given.
+    (SB3's own ``Video`` needs moviepy below 2.)
 
     .. code-block:: python
 
         video = EpisodeVideoCallback(gym.make("MountainCar-v0", render_mode="rgb_array"))
         KNNTD("MountainCar-v0", tensorboard_log="logs").learn(50_000, callback=video)
 
-    :param eval_env: where the episode takes place, with ``render_mode="rgb_array"``: another environment than that
-        of training, wrapped in the same wrappers. VecNormalize gets the statistics of training, as in EvalCallback
-    :param video_freq: record every so many calls (of n_envs steps each); ``None``: as often as takes a thousandth of
-        the time, which is once in half an hour or so
-    :param folder: where to write ``episode_{steps}.gif``; ``None`` for no files
-    :param max_steps: an episode is recorded up to this step
-    :param verbose: 1 for a line whenever a file is written
-    :raises ValueError: if an argument does not fit; when training begins, if the video has nowhere to go
+    :param eval_env: environment of the episodes, with ``render_mode="rgb_array"``: not the training environment, but
+        with the same wrappers. Its VecNormalize gets the statistics of the training environment, as in EvalCallback
+    :param video_freq: record every ``video_freq`` calls (of n_envs steps each); ``None``: as often as takes 0.1 % of
+        the time, about once in half an hour
+    :param folder: folder for ``episode_{steps}.gif``; ``None`` for no files
+    :param max_steps: maximum number of recorded steps
+    :param verbose: 1 to print a line for each written file
+    :raises ValueError: if an argument is invalid; when training begins, if there is neither TensorBoard nor a folder
     :raises ImportError: when training begins, if Pillow is not installed
     """
 
@@ -72,7 +72,7 @@ class EpisodeVideoCallback(ThrottledCallback):
         self.max_steps = check_integer("max_steps", max_steps, 1)
 
     def _init_callback(self) -> None:
-        # To be known before hours of training.
+        # Raise before training, not after hours of it.
         try:
             import PIL.Image  # noqa: F401
         except ImportError as error:
@@ -89,7 +89,7 @@ class EpisodeVideoCallback(ThrottledCallback):
         super()._on_training_start()
 
     def _writers(self) -> list[Any]:
-        """TensorBoard's own: an animated image is none of the values that SB3's logger knows."""
+        """TensorBoard's writers: SB3's logger does not support animated images."""
         outputs = picture_formats(self.logger)
         return [output.writer for output in outputs if isinstance(output, TensorBoardOutputFormat)]
 
@@ -110,7 +110,7 @@ class EpisodeVideoCallback(ThrottledCallback):
 
     def record(self) -> tuple[bytes, tuple[int, int]]:
         """
-        :return: an episode of the greedy policy as of now, a GIF, and its height and width in pixels
+        :return: an episode of the current greedy policy as a GIF, and its height and width in pixels
         """
         from PIL import Image
 

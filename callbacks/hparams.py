@@ -1,4 +1,4 @@
-"""The arguments of a run in TensorBoard, beside its results."""
+"""Hyperparameters of a run in TensorBoard, next to its results."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from sb3_knntd.common.checks import check_verbose, shown
 from .throttled import picture_formats, write
 
 METRICS = ("rollout/ep_rew_mean", "rollout/ep_len_mean", "train/td_error", "train/visited_points", "time/fps")
-#: Arguments that do not change what is learned.
+#: Arguments that are not logged: they do not influence learning.
 LEFT_OUT = {"self", "policy", "env", "policy_kwargs", "tensorboard_log", "verbose", "device", "_init_setup_model"}
-#: Longer descriptions are cut: each is a column of a table.
+#: Longer texts are truncated, characters: each is a column of a table.
 LONGEST = 60
 
 
 class HParamCallback(BatchedCallback):
     """
-    Writes the arguments of the model to TensorBoard's HParams when training begins. The metrics beside them are scalars
-    that the run logs.
+    Writes the hyperparameters of the model to TensorBoard's HParams when training begins. The metrics shown next to
+    them are scalars that the run logs.
 
     .. code-block:: python
 
@@ -33,9 +33,9 @@ class HParamCallback(BatchedCallback):
             model = KNNTD("MountainCar-v0", n_neighbors=n_neighbors, tensorboard_log="logs")
             model.learn(50_000, callback=HParamCallback())
 
-    :param metrics: names of the scalars; with EvalCallback ``"eval/mean_reward"`` is worth adding
+    :param metrics: names of the scalars; with EvalCallback, add ``"eval/mean_reward"``
     :param verbose: has no effect
-    :raises ValueError: if an argument does not fit; when training begins, if the model does not log to TensorBoard
+    :raises ValueError: if an argument is invalid; when training begins, if the model does not log to TensorBoard
     """
 
     def __init__(self, metrics: Sequence[str] = METRICS, verbose: int = 0) -> None:
@@ -59,8 +59,8 @@ class HParamCallback(BatchedCallback):
 
 def describe(model: Any) -> dict[str, bool | str | float | None]:
     """
-    :param model: any algorithm of SB3
-    :return: algorithm, environment, and the arguments that the model was made with, as numbers and short texts
+    :param model: any SB3 algorithm
+    :return: algorithm, environment, and the arguments of the model, as numbers and short texts
     """
     names = [name for name in inspect.signature(type(model).__init__).parameters if name not in LEFT_OUT]
     arguments = {name: getattr(model, name) for name in names if hasattr(model, name)} | (model.policy_kwargs or {})

@@ -13,20 +13,21 @@ from sb3_knntd.kernels.selection import UNDRAWN
 
 from .throttled import ThrottledCallback
 
-#: Every so many calls a transition is sampled. A prime, so that it is no multiple of the length of the episodes.
+#: Number of calls between two samples of transitions. A prime, so that it is unlikely to be a multiple of the episodes'
+#: length.
 STRIDE = 101
 QUANTILES = {"q05": 0.05, "q50": 0.5, "q95": 0.95}
 
 
 class Transitions(NamedTuple):
     """
-    What happened in a step; ``n`` is n_envs, or the number of those of several steps.
+    Transitions of one or more steps: ``n`` is n_envs times the number of steps.
 
     :param observations: shape (n, *obs_shape)
-    :param actions: as the environment took them, shape (n, *action_shape)
+    :param actions: actions of the environment, shape (n, *action_shape)
     :param rewards: shape (n,)
-    :param next_observations: the true ones, also where an episode ended, shape (n, *obs_shape)
-    :param terminated: whether nothing can follow, shape (n,), bool
+    :param next_observations: observations after the steps, before a reset, shape (n, *obs_shape)
+    :param terminated: whether the next state is terminal, shape (n,), bool
     """
 
     observations: np.ndarray
@@ -38,29 +39,29 @@ class Transitions(NamedTuple):
 
 class PerceptionStatsCallback(ThrottledCallback):
     """
-    Logs how observations are seen and what learning does, from a sample of the transitions (one call in 102) and at
-    training's end:
+    Logs statistics of the perception and of learning every ``log_freq`` calls and at the end of training. They are
+    computed from a sample of the transitions (one call in 102):
 
     ============================== ====================================================================================
-    ``perception/visited_share``   share of the points that were learned at
+    ``perception/visited_share``   share of the points that have been visited
     ``perception/neighbors``       effective number of neighbours, 1/Σp², from 1 to k; the mean over the sample
-    ``perception/outside_share``   share of the observations beyond the bounds in some dimension
-    ``train/td_error_q05``         5 % quantile of the TD errors of the sample, by the table as it is now; likewise
+    ``perception/outside_share``   share of the observations that are outside the bounds in some dimension
+    ``train/td_error_q05``         5 % quantile of the TD errors of the sample, with the current table; likewise
                                    ``_q50`` and ``_q95``
-    ``train/trace_length``         1/(1 - γλ), the sum of a trace's decays: for how many steps a state is credited
+    ``train/trace_length``         1/(1 - γλ), the sum of a trace's decays: the effective number of credited steps
     ``train/trace_points``         number of points that have a trace
-    ``train/policy_changes``       share of the last log's sample at which the greedy action is another now
+    ``train/policy_changes``       share of the previous log's sample at which the greedy action has changed
     ============================== ====================================================================================
 
     .. code-block:: python
 
         KNNTD("MountainCar-v0", tensorboard_log="logs").learn(50_000, callback=PerceptionStatsCallback())
 
-    :param log_freq: log every so many calls (of n_envs steps each); ``None``: as often as takes two thousandths
-        of the time, which is once in five seconds or so
-    :param n_samples: number of transitions that the sample is of, the last ones
+    :param log_freq: log every ``log_freq`` calls (of n_envs steps each); ``None``: as often as takes 0.2 % of the time,
+        about once in five seconds
+    :param n_samples: number of transitions in the sample, the most recent ones
     :param verbose: has no effect
-    :raises ValueError: if an argument does not fit
+    :raises ValueError: if an argument is invalid
     """
 
     SHARE: ClassVar[float] = 0.002
@@ -71,7 +72,7 @@ class PerceptionStatsCallback(ThrottledCallback):
         self.n_samples = check_integer("n_samples", n_samples, 1)
         self._sample: deque[Transitions] = deque()
         self._earlier: tuple[np.ndarray, np.ndarray] | None = None
-        # Which action follows is drawn anew: the model's own numbers are not touched.
+        # A separate generator for the next actions, so that the model's random numbers do not change.
         self._generator = np.random.default_rng(0)
 
     def _on_training_start(self) -> None:
@@ -89,13 +90,13 @@ class PerceptionStatsCallback(ThrottledCallback):
         return min(super()._next_due(), self._sample_at)
 
     def _take(self) -> None:
-        """Keep the observations, and in the next step what came of them."""
+        """Store the observations, and in the next step their transitions."""
         local = self.locals
         if self._before is None:
             self._before = np.copy(local["new_obs"])
             self._sample_at = self.n_calls + 1
             return
-        # Random steps that a range is measured by are no learning.
+        # The random steps that measure the range of observations are not learned from.
         if not self.model._measuring:
             self._sample.append(_transitions(self._before, local))
         self._before = None
@@ -126,13 +127,13 @@ class PerceptionStatsCallback(ThrottledCallback):
 
     def _outside(self, observations: np.ndarray) -> float:
         bounds = self.model.policy.perceiver.bounds
-        # As observations mostly are: the float32 next to a bound is not beyond it.
+        # Most observations are float32, and the float32 nearest to a bound counts as inside.
         places = observations.reshape(len(observations), -1).astype(np.float32)
         low, high = (bound.cpu().numpy().astype(np.float32) for bound in (bounds.low, bounds.high))
         return float(((places < low) | (places > high)).any(axis=1).mean())
 
     def _td_errors(self, sample: Transitions) -> np.ndarray:
-        """r + γ times the value of the next state as a target, minus Q(s, a), by the table as it is."""
+        """r + γ times the target value of the next state, minus Q(s, a), with the current table."""
         model = self.model
         policy = model.policy
         selector = policy.selector
@@ -152,7 +153,7 @@ class PerceptionStatsCallback(ThrottledCallback):
 
 
 def _transitions(before: np.ndarray, local: dict[str, Any]) -> Transitions:
-    """What the callback's locals tell of the step that followed ``before``."""
+    """The transitions of the current step, from the callback's locals and the observations before it."""
     after, dones = np.copy(local["new_obs"]), np.copy(local["dones"])
     for index in np.flatnonzero(dones):
         info = local["infos"][index]

@@ -25,25 +25,25 @@ from sb3_knntd.common.plain import class_name, loaded_class
 
 from .throttled import ThrottledCallback
 
-#: The file in a checkpoint with the names of the classes and the mean return.
+#: Member of a checkpoint that holds the names of the classes and the mean return.
 NOTES = "checkpoint.json"
 #: The same in checkpoints of earlier versions.
 OLD_NOTES = "checkpoint.pkl"
-#: In bytes; usually they are a few hundred.
+#: Maximum size of this member, bytes; a few hundred are usual.
 LARGEST_NOTES = 2**20
 WRAPPER = "vec_env_wrapper_{}.pkl"
 
 
 class TableCheckpointCallback(ThrottledCallback):
     """
-    Saves the model, with the statistics of VecNormalize and of any other VecEnvWrapper that has ``save`` and ``load``
-    as it has, when training ends, and before that every ``save_freq`` calls. The last ones and the best are kept:
-    ``{name_prefix}_{steps}_steps.zip`` and ``{name_prefix}_best.zip``. The best is the one with the highest mean
-    return of the last training episodes (``rollout/ep_rew_mean``, over ``stats_window_size`` episodes) when it was
-    saved; for the best of evaluations there is SB3's EvalCallback.
+    Saves the model every ``save_freq`` calls and at the end of training, together with the statistics of VecNormalize
+    and of any other VecEnvWrapper with the same methods ``save`` and ``load``. The last checkpoints and the best one
+    are kept: ``{name_prefix}_{steps}_steps.zip`` and ``{name_prefix}_best.zip``. The best checkpoint is the one with
+    the highest mean return of the last training episodes (``rollout/ep_rew_mean``, over ``stats_window_size``
+    episodes) when it was saved; for the best model in evaluations use SB3's EvalCallback.
 
-    Each is one file, written beside and renamed when it is whole: whatever stops the process, even the machine, the
-    newest checkpoint is whole. It is a model as ``KNNTD.load`` takes it, too.
+    Each checkpoint is one file that is written atomically: even if the process or the machine stops, the newest
+    checkpoint is complete. ``KNNTD.load`` can load it as well.
 
     .. code-block:: python
 
@@ -55,14 +55,14 @@ class TableCheckpointCallback(ThrottledCallback):
         model.learn(1_000_000 - model.num_timesteps, callback=callback, reset_num_timesteps=False)
 
     :param save_path: folder
-    :param save_freq: save every so many calls (of n_envs steps each); ``None``: as often as takes a thousandth of
-        the time, which is every half a minute or so with a small table
-    :param n_last: how many of the last are kept, >= 1
-    :param save_best: whether to keep the best
-    :param name_prefix: what the files' names begin with
-    :param verbose: 1 for a line whenever a file is written
-    :raises ValueError: if an argument does not fit; when training begins, if the folder holds checkpoints of later
-        steps, which are those of another run
+    :param save_freq: save every ``save_freq`` calls (of n_envs steps each); ``None``: as often as takes 0.1 % of the
+        time, about once in half a minute with a small table
+    :param n_last: number of last checkpoints to keep, >= 1
+    :param save_best: whether to keep the best checkpoint
+    :param name_prefix: prefix of the file names
+    :param verbose: 1 to print a line for each written file
+    :raises ValueError: if an argument is invalid; when training begins, if the folder holds checkpoints of later steps,
+        which belong to another run
     """
 
     FIRST_SECONDS: ClassVar[float] = 0.05
@@ -81,17 +81,17 @@ class TableCheckpointCallback(ThrottledCallback):
         self.n_last = check_integer("n_last", n_last, 1)
         self.save_best = check_flag("save_best", save_best)
         self.name_prefix = check_name("name_prefix", name_prefix)
-        #: mean return of the best so far, ``None`` before there is one
+        #: mean return of the best checkpoint so far, ``None`` if there is none
         self.best_mean_reward: float | None = None
 
     @property
     def best_path(self) -> Path:
-        """Where the best is."""
+        """Path of the best checkpoint."""
         return self.save_path / f"{self.name_prefix}_best.zip"
 
     def _init_callback(self) -> None:
         self.save_path.mkdir(parents=True, exist_ok=True)
-        # Remove leftovers now: it may be long before there is a better one.
+        # Remove temporary files now: the next best checkpoint may be written much later.
         sweep(self.best_path)
 
     def _on_training_start(self) -> None:
@@ -132,24 +132,24 @@ class TableCheckpointCallback(ThrottledCallback):
         **kwargs: Any,
     ) -> KNNAlgorithm:
         """
-        The model of the newest checkpoint, with its environment as it was wrapped then. Go on with
+        Load the model of the newest checkpoint, with the saved wrappers around its environment. Continue training with
         ``model.learn(remaining_steps, reset_num_timesteps=False)``.
 
-        A wrapper that was saved takes the place of one of its class around ``env``; if there is none, it is put around
-        ``env``. So ``env`` may be what the first run's script makes, or what that wraps.
+        A saved wrapper replaces the wrapper of the same class around ``env``; if there is none, it is put around
+        ``env``. So ``env`` may be wrapped as in the first run, or not wrapped.
 
-        :param path: folder, or one checkpoint, such as the best
-        :param env: the environment to go on in
-        :param name_prefix: what the files' names begin with
-        :param force_reset: whether new episodes begin. ``False`` is for an environment that is still in the state it
-            was in: learning then goes on as if it had not been interrupted, to the bit
-        :param trusted: whether to unpickle what the file holds, see :meth:`~sb3_knntd.KNNTD.load`. Without trust a
-            VecNormalize, which is saved by pickle, cannot be brought back; a VecDeltaFilter can
+        :param path: folder, or a single checkpoint, such as the best one
+        :param env: the environment to continue in
+        :param name_prefix: prefix of the file names
+        :param force_reset: whether to start new episodes. Use ``False`` for an environment that is still in the saved
+            state: learning then continues exactly as if it had not been interrupted
+        :param trusted: whether to unpickle objects, see :meth:`~sb3_knntd.KNNTD.load`. With ``False``, a VecNormalize,
+            which is saved by pickle, cannot be restored; a VecDeltaFilter can
         :param kwargs: other arguments of :meth:`~sb3_knntd.KNNTD.load`
         :return: the model; its environment is ``model.get_env()``
         :raises FileNotFoundError: if there is no checkpoint
-        :raises ValueError: if the file is damaged or no checkpoint, ``env`` has other spaces, a class of the model or
-            of a wrapper has not been imported, or without trust something would have to be unpickled
+        :raises ValueError: if the file is damaged or no checkpoint, the spaces of ``env`` differ, a class of the model
+            or of a wrapper has not been imported, or, with ``trusted=False``, an object would have to be unpickled
         """
         file = Path(path)
         if not file.is_file():
@@ -162,7 +162,7 @@ class TableCheckpointCallback(ThrottledCallback):
         algorithm: type[KNNAlgorithm] = loaded_class(notes["algorithm"], KNNAlgorithm)
         venv = KNNAlgorithm._wrap_env(maybe_make_env(env, verbose=0), verbose=0)
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(file) as archive:
-            # From the inside out, as each is put around what is there by then.
+            # From the inside out, since each wrapper is put around the previous ones.
             for index, name in reversed(list(enumerate(notes["wrappers"]))):
                 wrapper = loaded_class(name, VecEnvWrapper)
                 venv = _rewrap(venv, wrapper, archive.extract(WRAPPER.format(index), folder), trusted)
@@ -174,7 +174,7 @@ def _path_of(folder: Path, name_prefix: str, step: int) -> Path:
 
 
 def _steps_of(folder: Path, name_prefix: str) -> list[int]:
-    """The steps that there are checkpoints of, rising."""
+    """The steps of all checkpoints, ascending."""
     prefix, suffix = f"{name_prefix}_", "_steps.zip"
     names = (path.name for path in folder.glob("*.zip"))
     numbers = (name[len(prefix) : -len(suffix)] for name in names if name.startswith(prefix) and name.endswith(suffix))
@@ -198,7 +198,7 @@ def _saveable_wrappers(venv: VecEnv | None) -> list[Any]:
     """The wrappers that can be saved and loaded like VecNormalize, the outermost first."""
     wrappers = []
     while isinstance(venv, VecEnvWrapper):
-        # Ask the class: a wrapper looks up missing attributes in the environment that it wraps.
+        # Check the class: an instance looks up missing attributes in the environment that it wraps.
         if all(callable(getattr(type(venv), name, None)) for name in ("save", "load")):
             wrappers.append(venv)
         venv = venv.venv
@@ -206,12 +206,12 @@ def _saveable_wrappers(venv: VecEnv | None) -> list[Any]:
 
 
 def _rewrap(venv: VecEnv, wrapper: type[Any], saved: str, trusted: bool) -> VecEnv:
-    """Load a wrapper, in place of the wrapper of its class, or around all if there is none."""
+    """Load a wrapper in place of the wrapper of the same class, or around all wrappers if there is none."""
     takes_trust = "trusted" in signature(wrapper.load).parameters
     if not (trusted or takes_trust):
         raise ValueError(
-            f"a {wrapper.__name__} is saved by pickle, and to read it would be to run what the file says. If you trust "
-            "whom it is from, give trusted=True"
+            f"a {wrapper.__name__} is saved by pickle, and unpickling executes code from the file. If you trust its "
+            "source, pass trusted=True"
         )
     how = {"trusted": trusted} if takes_trust else {}
     around: list[VecEnvWrapper] = []
@@ -230,13 +230,13 @@ def _rewrap(venv: VecEnv, wrapper: type[Any], saved: str, trusted: bool) -> VecE
 
 
 class _Names(pickle.Unpickler):
-    """Unpickles names and numbers only; nothing is imported or called."""
+    """Unpickles only names and numbers; nothing is imported or called."""
 
     def find_class(self, module: str, name: str) -> Any:
         """
-        :param module: of a class
-        :param name: of the class
-        :return: its name, which stands for it
+        :param module: module of a class
+        :param name: name of the class
+        :return: its full name, in place of the class
         """
         return f"{module}.{name}"
 

@@ -1,4 +1,4 @@
-"""Callbacks that act seldom, because acting takes longer than a step."""
+"""Base class of callbacks that act rarely, because acting takes longer than a step."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ CALLS_PER_CLOCK_READ = 128
 
 class ThrottledCallback(BatchedCallback):
     """
-    Acts every ``freq`` calls, or as often as a share of the time allows, and when training ends.
+    Acts every ``freq`` calls, or as often as a share of the time allows, and at the end of training.
 
-    :param name: name of the argument that ``freq`` was given as
+    :param name: name of the argument ``freq`` in the subclass, for messages
     :param freq: act every ``freq`` calls (of n_envs steps each); ``None``: as often as acting takes :attr:`SHARE` of
         the time
-    :param verbose: 0 for no output, 1 for a line whenever a file is written
-    :raises ValueError: if ``freq`` is neither ``None`` nor an integer >= 1, or ``verbose`` does not fit
+    :param verbose: 0 for no output, 1 to print a line for each written file
+    :raises ValueError: if ``freq`` is neither ``None`` nor an integer >= 1, or ``verbose`` is invalid
     """
 
     model: KNNAlgorithm
@@ -70,7 +70,7 @@ class ThrottledCallback(BatchedCallback):
         return self.n_calls % self.freq == 0
 
     def _next_due(self) -> int:
-        """The next call at which it may be time to act."""
+        """The next call at which :meth:`_is_time` must be checked."""
         return self.n_calls + (CALLS_PER_CLOCK_READ if self.freq is None else self.freq - self.n_calls % self.freq)
 
     def _on_training_end(self) -> None:
@@ -80,13 +80,13 @@ class ThrottledCallback(BatchedCallback):
 
     @abstractmethod
     def _act(self) -> None:
-        """Do what this callback is for."""
+        """Perform the action of this callback."""
 
 
 def picture_formats(logger: Logger) -> list[KVWriter]:
     """
-    :param logger: SB3's
-    :return: its outputs that can show pictures: TensorBoard, and outputs defined elsewhere
+    :param logger: SB3's logger
+    :return: its outputs that can show images: TensorBoard, and outputs that are not part of SB3
     """
     text = HumanOutputFormat, JSONOutputFormat, CSVOutputFormat
     return [output for output in logger.output_formats if not isinstance(output, text)]
@@ -94,9 +94,9 @@ def picture_formats(logger: Logger) -> list[KVWriter]:
 
 def write(outputs: list[KVWriter], key: str, value: Any, step: int) -> None:
     """
-    Write one value now, not with the next log of the algorithm, since it belongs to this step.
+    Write one value now, instead of with the algorithm's next log, since it belongs to this step.
 
-    :param outputs: of :func:`picture_formats`
+    :param outputs: outputs of the logger, see :func:`picture_formats`
     :param key: its key in the log
     :param value: a number, or SB3's ``Image`` or ``HParam``
     :param step: number of environment steps

@@ -1,4 +1,4 @@
-"""What was learned, as a picture."""
+"""Plots of the learned values during training."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from .visitation import Visitation, last_observation
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Dots per inch. A finer picture takes longer to draw, and TensorBoard shows it no larger.
+#: Dots per inch. A higher resolution takes longer to draw, and TensorBoard does not show it.
 DPI = 100
-#: Panels beside each other; an action of many dimensions goes on below.
+#: Number of panels in a row; further action dimensions are drawn in more rows.
 COLUMNS = 3
 
 
 class ValueMapCallback(ThrottledCallback):
     """
-    Draws over two dimensions of the observations: the value V(s) = max_a Q(s, a) with the ways that the last episodes
-    of the first environment took, the greedy action, and how often each cell was visited by any environment since the
-    callback is in use. A picture is drawn when training ends, and before that every ``draw_freq`` calls.
+    Draws, over two dimensions of the observations: the value V(s) = max_a Q(s, a) with the trajectories of the last
+    episodes of the first environment, the greedy action, and the number of visits of each cell by all environments
+    since the first training with this callback. It draws every ``draw_freq`` calls and at the end of training.
 
-    Pictures go to TensorBoard's images under ``map/value``, if the model logs there, and to ``folder``, if one is
+    The pictures are written to TensorBoard's images under ``map/value`` if the model logs there, and to ``folder`` if
     given.
 
     .. code-block:: python
@@ -55,18 +55,18 @@ class ValueMapCallback(ThrottledCallback):
         model.learn(50_000, callback=ValueMapCallback(draw_freq=10_000))
 
     :param dims: the two dimensions, horizontal and vertical
-    :param fixed: where to hold other dimensions, observation units (with VecNormalize the normalised ones)
-    :param average: what is done with the dimensions that ``fixed`` does not name: held in the middle of their range,
-        or averaged over, see :func:`~sb3_knntd.plots.value_grid`
-    :param draw_freq: draw every so many calls (of n_envs steps each); ``None``: as often as takes a thousandth
-        of the time, which is a few times in an hour
-    :param n_routes: how many episodes are drawn, the last ones
+    :param fixed: values of other dimensions, observation units (with VecNormalize, normalised)
+    :param average: whether to average over the dimensions not in ``fixed``, see :func:`~sb3_knntd.plots.value_grid`; by
+        default they are fixed in the middle of their range
+    :param draw_freq: draw every ``draw_freq`` calls (of n_envs steps each); ``None``: as often as takes 0.1 % of the
+        time, a few times per hour
+    :param n_routes: number of trajectories, of the last episodes
     :param resolution: number of cells in each of the two dimensions, up to 4096
-    :param folder: where to write ``value_map_{steps}.png``; ``None`` for no files
-    :param names: what dimensions and actions are called; ``None`` for what is known of the environment
-    :param verbose: 1 for a line whenever a file is written
-    :raises ValueError: if an argument does not fit; when training begins, if the observations are not a Box of two or
-        more dimensions, ``dims``, ``fixed`` or ``names`` do not fit them, or pictures have nowhere to go
+    :param folder: folder for ``value_map_{steps}.png``; ``None`` for no files
+    :param names: names of the dimensions and actions; by default those of known environments, otherwise numbers
+    :param verbose: 1 to print a line for each written file
+    :raises ValueError: if an argument is invalid; when training begins, if the observations are not a Box of two or
+        more dimensions, ``dims``, ``fixed`` or ``names`` do not fit them, or there is neither TensorBoard nor a folder
     :raises ImportError: when training begins, if matplotlib is not installed
     """
 
@@ -95,7 +95,7 @@ class ValueMapCallback(ThrottledCallback):
         self._visitation = Visitation(self.dims, self.resolution, self.n_routes)
 
     def _init_callback(self) -> None:
-        # Arguments that do not fit, and a missing matplotlib, must raise before hours of training.
+        # Invalid arguments and a missing matplotlib must raise before training, not after hours of it.
         value_grid(self.model, self.dims, self.fixed, 1, self.average)
         names_for(self.model, self.names)
         new_figure(1.0, 1.0)
@@ -114,7 +114,7 @@ class ValueMapCallback(ThrottledCallback):
 
     def recorder(self) -> Callable[[np.ndarray], object]:
         """
-        :return: a function that is given the observations of every step
+        :return: a function to call with the observations of every step
         """
         return self._visitation.recent.append
 
@@ -157,7 +157,7 @@ class ValueMapCallback(ThrottledCallback):
 
     def draw(self) -> Figure:
         """
-        :return: a picture of the model as it is now; save it with ``figure.savefig(path)``
+        :return: a figure of the current model; save it with ``figure.savefig(path)``
         """
         visitation = self._visitation
         visitation.count(self._extent())

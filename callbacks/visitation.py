@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-#: Steps that are buffered: counting many at once takes a hundredth of the time.
+#: Number of buffered steps: counting many at once takes a hundredth of the time.
 BUFFERED = 1024
-#: Of a longer trajectory this many of the last buffers are kept.
+#: Maximum length of a trajectory, buffers; the last ones are kept.
 MAX_CHUNKS = 10
 
 Extent = tuple[float, float, float, float]
@@ -73,7 +73,7 @@ class Visitation:
         self._extent = extent
         if not self.recent:
             return
-        # What np.stack does, in a third of its time.
+        # Like np.stack, in a third of its time.
         observations = np.concatenate(self.recent).reshape(len(self.recent), *self.recent[0].shape)
         self._cut(observations[:, 0])
         places = observations[..., list(self.dims)].reshape(-1, 2)
@@ -108,7 +108,7 @@ class Visitation:
         low, high = np.array([left, bottom], np.float32), np.array([right, top], np.float32)
         inside = ((places >= low) & (places <= high)).all(axis=1)
         resolution = len(self.counts)
-        # The upper end belongs to the last cell.
+        # The upper bound belongs to the last cell.
         cells = np.minimum((places[inside] - low) / (high - low) * resolution, resolution - 1).astype(np.int64)
         counts = np.zeros((resolution, resolution), np.int64)
         np.add.at(counts, (cells[:, 1], cells[:, 0]), numbers[inside])
@@ -117,8 +117,8 @@ class Visitation:
 
 def last_observation(infos: Sequence[dict[str, Any]], observations: np.ndarray) -> np.ndarray:
     """
-    :param infos: of the step that ended the first environment's episode
-    :param observations: what the environments show now, shape (n_envs, obs_dim)
-    :return: the observation the episode ended with, shape (obs_dim,)
+    :param infos: infos of the step that ended the first environment's episode
+    :param observations: the current observations, shape (n_envs, obs_dim)
+    :return: the last observation of the episode, shape (obs_dim,)
     """
     return np.asarray(infos[0].get("terminal_observation", observations[0]))

@@ -18,6 +18,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     :param argv: arguments of the command line, without the program's name; by default those of this process
     :return: exit code
-    :raises SystemExit: with code 2 if the user made a mistake, with 0 after ``--help`` and ``--version``
+    :raises SystemExit: with code 2 if the arguments are invalid, with 0 after ``--help`` and ``--version``
     """
     return run_commands(COMMANDS, argv)

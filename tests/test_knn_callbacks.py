@@ -185,7 +185,7 @@ def test_another_algorithm_is_refused(tmp_path: pathlib.Path, make: Callable[...
         (lambda: ValueMapCallback(n_routes=10**400), "n_routes must be an integer >= 0 and < 2"),
         (lambda: ValueMapCallback(dims=None), "dims must be two different dimensions, counted from 0; got None"),
         (lambda: ValueMapCallback(dims=(0, 0.5)), "dims must be two different dimensions"),
-        (lambda: ValueMapCallback(fixed=[1.0]), r"fixed must give dimensions and where to hold them.*\[1.0\]"),
+        (lambda: ValueMapCallback(fixed=[1.0]), r"fixed must be a dict of dimensions and their values.*\[1.0\]"),
         (lambda: ValueMapCallback(fixed={2: np.nan}), "fixed must be a finite number"),
         (lambda: ValueMapCallback(average="yes"), "average must be True or False; got 'yes'"),
         (lambda: ValueMapCallback(folder=3), "folder must be a path.*got 3"),

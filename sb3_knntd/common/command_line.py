@@ -159,7 +159,7 @@ def run_commands(commands: Sequence[AddCommand], argv: Sequence[str] | None = No
     :param argv: arguments of the command line, without the program's name; by default those of this process
     :param prog: the program's name
     :return: exit code
-    :raises SystemExit: with code 2 if the user made a mistake, with 0 after ``--help`` and ``--version``
+    :raises SystemExit: with code 2 if the arguments are invalid, with 0 after ``--help`` and ``--version``
     """
     parser = Parser(prog=prog, description="kNN-TD(λ) for Stable-Baselines3: a table at k nearest points, no network.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('sb3-knntd')}")

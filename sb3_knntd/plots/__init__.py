@@ -1,4 +1,4 @@
-"""Pictures of learning and of what was learned. matplotlib comes with ``pip install "sb3-knntd[extra]"``."""
+"""Plots of learning curves and learned values. They need matplotlib: ``pip install "sb3-knntd[extra]"``."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def running_median(values: Sequence[float] | np.ndarray, window: int) -> np.ndarray:
     """
     :param values: shape (n,)
-    :param window: number of values that a median is over
+    :param window: number of values in a window
     :return: the median of each value and the ``window - 1`` before it (fewer at the beginning), shape (n,)
     :raises ValueError: if ``window`` < 1
     """
@@ -34,15 +34,15 @@ def plot_learning_curve(
     axes: Axes | None = None,
 ) -> Axes:
     """
-    Draw the return of each episode, and their running median, over the steps taken.
+    Plot the return of each episode and the running median against the number of environment steps.
 
-    :param steps: environment steps at the end of each episode, shape (n_episodes,)
+    :param steps: number of environment steps at the end of each episode, shape (n_episodes,)
     :param returns: sum of rewards of each episode, shape (n_episodes,)
     :param baseline: return to compare with, drawn as a dashed line
-    :param baseline_label: what it is the return of
-    :param window: number of episodes that a median is over; by default a tenth of them, 5 at least and 100 at most
-    :param axes: where to draw; a new figure if not given
-    :return: the axes drawn on; :func:`figure_of` tells their figure
+    :param baseline_label: label of the baseline
+    :param window: number of episodes of the running median; by default a tenth of all, from 5 to 100
+    :param axes: axes to draw on; a new figure if not given
+    :return: the axes; see :func:`figure_of` for their figure
     :raises ValueError: if ``steps`` and ``returns`` differ in length
     """
     if len(steps) != len(returns):
@@ -75,7 +75,7 @@ def plot_learning_curve(
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     if axes.get_legend_handles_labels()[1]:
-        # Above the axes it covers no line, whichever way the curve goes.
+        # Above the axes, the legend cannot cover a line.
         axes.legend(
             loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, fontsize="small", borderaxespad=0.2
         )

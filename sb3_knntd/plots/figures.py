@@ -1,4 +1,4 @@
-"""Figures that belong to no window, and the colours of all pictures."""
+"""Figures without a window, and the colours of all plots."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Resolution of the files, dots per inch.
+#: Resolution of saved figures, dots per inch.
 DPI = 150
 LINE_COLOR = "#00488d"
 BASELINE_COLOR = "#b35900"
@@ -17,9 +17,9 @@ UNLEARNED_COLOR = "#e4e4e4"
 
 def new_figure(width: float, height: float) -> Figure:
     """
-    :param width: inches
-    :param height: inches
-    :return: a figure that belongs to no window and to no global state; save it with ``figure.savefig(path)``
+    :param width: width, inches
+    :param height: height, inches
+    :return: a figure without a window that pyplot does not manage; save it with ``figure.savefig(path)``
     :raises ImportError: if matplotlib is not installed
     """
     try:
@@ -32,8 +32,8 @@ def new_figure(width: float, height: float) -> Figure:
 
 def figure_of(axes: Axes) -> Figure:
     """
-    :param axes: axes that were drawn on
-    :return: the figure that they are part of
+    :param axes: any axes
+    :return: their figure
     """
     figure = axes.get_figure(root=True)
     assert figure is not None

@@ -13,11 +13,11 @@ from sb3_knntd.actions.selection import mean_rows
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.common.checks import check_integer, check_number, shown
 
-#: The largest resolution of a grid; a picture has fewer dots.
+#: The largest resolution of a grid; figures have fewer pixels.
 FINEST = 4096
-#: Number of observations in a batch. With thousands of points a larger batch would take gigabytes.
+#: Number of observations in a batch. With thousands of points, a larger batch would take gigabytes.
 BATCH = 512
-#: Number of places in the other dimensions that are averaged over.
+#: Number of places in the remaining dimensions over which values are averaged.
 AVERAGED_PLACES = 32
 
 
@@ -27,11 +27,11 @@ class ValueGrid(NamedTuple):
 
     :param dims: the two dimensions, of the columns and of the rows
     :param extent: (left, right, bottom, top), the range of the two dimensions, observation units
-    :param fixed: where other dimensions are held, observation units
-    :param averaged: the dimensions that are averaged over
-    :param q_values: at the middle of each cell, shape (resolution, resolution, n_actions), rows from bottom up
+    :param fixed: values of the fixed dimensions, observation units
+    :param averaged: the dimensions over which values are averaged
+    :param q_values: Q(s, ·) at the centre of each cell, shape (resolution, resolution, n_actions), rows from bottom up
     :param values: V(s), shape (resolution, resolution)
-    :param actions: the greedy action, shape (resolution, resolution), int64, counted from 0; of ExA its mean, shape
+    :param actions: the greedy action, counted from 0, shape (resolution, resolution), int64; with ExA the vector, shape
         (resolution, resolution, action_dim), action units
     :param learned: whether an entry of the k nearest points differs from the initial value,
         shape (resolution, resolution)
@@ -49,7 +49,7 @@ class ValueGrid(NamedTuple):
 
 def check_dims(dims: Any) -> tuple[int, int]:
     """
-    :param dims: what was given as ``dims``
+    :param dims: value given for ``dims``
     :return: two different dimensions
     :raises ValueError: if it is anything else
     """
@@ -64,14 +64,14 @@ def check_dims(dims: Any) -> tuple[int, int]:
 
 def check_fixed(fixed: Any) -> dict[int, float] | None:
     """
-    :param fixed: what was given as ``fixed``
-    :return: dimensions, and where each is held
-    :raises ValueError: if it is anything else, or not finite
+    :param fixed: value given for ``fixed``
+    :return: the value of each fixed dimension, or ``None``
+    :raises ValueError: if it is anything else, or a value is not finite
     """
     if fixed is None:
         return None
     if not isinstance(fixed, Mapping):
-        raise ValueError(f"fixed must give dimensions and where to hold them, {{2: 0.0}} say; got {shown(fixed)}")
+        raise ValueError(f"fixed must be a dict of dimensions and their values, e.g. {{2: 0.0}}; got {shown(fixed)}")
     return {check_integer("fixed: a dimension", dim, 0): check_number("fixed", fixed[dim]) for dim in fixed}
 
 
@@ -83,16 +83,16 @@ def value_grid(
     average: bool = False,
 ) -> ValueGrid:
     """
-    Read values and greedy actions over the range of two dimensions.
+    Compute values and greedy actions over the range of two dimensions.
 
-    :param model: a model of Box observations with at least two dimensions
+    :param model: a model with Box observations of at least two dimensions
     :param dims: the two dimensions, horizontal and vertical
-    :param fixed: where to hold other dimensions, observation units
+    :param fixed: values of other dimensions, observation units
     :param resolution: number of cells in each of the two dimensions
-    :param average: what is done with the dimensions that ``fixed`` does not name: they are held in the middle of their
-        range, or, if true, averaged over 32 places spread over it, of which those count where something was learned.
-        The action is then the one that is greedy at most of the places, and with ExA the mean
-    :return: the values. With VecNormalize, observation units are the normalised ones that the model sees
+    :param average: whether to average over the dimensions not in ``fixed``, at 32 places spread over their range,
+        ignoring places where nothing was learned; the action is then the most frequent greedy action, with ExA the
+        mean. By default, these dimensions are fixed in the middle of their range
+    :return: the values. With VecNormalize, observation units are normalised
     :raises ValueError: if the observations are not a Box of two or more dimensions, or ``dims``, ``fixed`` or
         ``resolution`` do not fit
     """
@@ -122,11 +122,11 @@ def value_grid(
 
 def telling_dims(model: KNNAlgorithm, resolution: int = 60) -> tuple[int, int]:
     """
-    Choose the two dimensions along which the value changes most, the others held in the middle of their range.
+    Choose the two dimensions along which the value changes most, with the others fixed in the middle of their range.
 
-    :param model: a model of Box observations with at least two dimensions
-    :param resolution: number of places looked at in each dimension
-    :return: two dimensions, the lower first
+    :param model: a model with Box observations of at least two dimensions
+    :param resolution: number of evaluated places in each dimension
+    :return: two dimensions, the lower one first
     """
     low, high = _range(model)
     if len(low) == 2:
@@ -143,7 +143,7 @@ def telling_dims(model: KNNAlgorithm, resolution: int = 60) -> tuple[int, int]:
 def _check_view(
     model: KNNAlgorithm, dims: tuple[int, int], fixed: Mapping[int, float] | None, resolution: int, average: bool
 ) -> tuple[dict[int, float], tuple[int, ...]]:
-    """Check a view; the values of the held dimensions, and the averaged dimensions."""
+    """Check the arguments of :func:`value_grid`; the values of the fixed dimensions, and the averaged dimensions."""
     space = model.observation_space
     if not isinstance(space, spaces.Box) or space.shape[0] < 2:
         raise ValueError(f"a value function is drawn over two dimensions of a Box of observations; got {space}")
@@ -193,7 +193,7 @@ def _places(low: np.ndarray, high: np.ndarray, averaged: tuple[int, ...]) -> np.
     """Evenly spread places in the averaged dimensions, shape (n_places, len(averaged))."""
     if not averaged:
         return np.empty((1, 0))
-    # The import takes two seconds, and most pictures do not need it.
+    # The import takes two seconds, and most plots do not need it.
     from scipy.stats import qmc
 
     dims = list(averaged)
@@ -203,7 +203,7 @@ def _places(low: np.ndarray, high: np.ndarray, averaged: tuple[int, ...]) -> np.
 
 
 def _join(readings: Sequence[_Reading], n_actions: int) -> _Reading:
-    """The mean over the places where something was learned; where nothing was, over all."""
+    """The mean over the places where something was learned, or over all places if nothing was."""
     if len(readings) == 1:
         return readings[0]
     q_values, values, actions, learned = (np.stack(part) for part in zip(*readings, strict=True))

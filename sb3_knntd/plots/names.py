@@ -23,7 +23,7 @@ class Names(NamedTuple):
     actions: tuple[str, ...]
 
 
-#: The environments of gymnasium whose spaces KNNTD or ExA takes.
+#: Names for the environments of gymnasium whose spaces KNNTD or ExA supports.
 NAMES = {
     "MountainCar-v0": Names(("position", "velocity (position per step)"), ("push left", "no push", "push right")),
     "CartPole-v1": Names(
@@ -41,9 +41,9 @@ NAMES = {
 
 def check_names(names: Any) -> Names | None:
     """
-    :param names: what was given as ``names``
-    :return: the same
-    :raises ValueError: if it is neither ``None`` nor two lists of words
+    :param names: value given for ``names``
+    :return: the names as tuples, or ``None``
+    :raises ValueError: if it is neither ``None`` nor two lists of strings
     """
     if names is None:
         return None
@@ -58,9 +58,9 @@ def check_names(names: Any) -> Names | None:
 
 def names_for(model: KNNAlgorithm, names: Names | None = None) -> Names:
     """
-    :param model: a model of Box observations
-    :param names: what the user wants them to be called
-    :return: these, or else those in ``NAMES`` of the model's environment, or else numbers
+    :param model: a model with Box observations
+    :param names: names given by the user
+    :return: the given names; by default those of the model's environment in ``NAMES``, or numbers if it is not there
     :raises ValueError: if ``names`` does not fit the model's spaces
     """
     names = check_names(names)
@@ -85,7 +85,7 @@ def _fit(names: Names, model: KNNAlgorithm) -> bool:
 
 
 def _count_actions(model: KNNAlgorithm) -> int:
-    """Number of actions, or of their dimensions."""
+    """Number of actions, or of action dimensions."""
     space = model.action_space
     return int(space.n) if isinstance(space, spaces.Discrete) else int(np.prod(space.shape or ()))
 

@@ -1,4 +1,4 @@
-"""Pictures over two dimensions of the observations: values, greedy actions, visits, trajectories."""
+"""Plots over two dimensions of the observations: values, greedy actions, visits, trajectories."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sb3_knntd.plots.names import Names, names_for
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: With more actions than this not every one is named: there is no room.
+#: Maximum number of actions of which each is named in the colour bar.
 MOST_NAMED_ACTIONS = 10
 
 
@@ -31,19 +31,19 @@ def plot_value_function(
     average: bool = False,
 ) -> tuple[Axes, ...]:
     """
-    Draw V(s) = max_a Q(s, a) and the greedy action over two dimensions of the observations. Grey cells
-    are those whose k nearest points all have the initial value.
+    Plot V(s) = max_a Q(s, a) and the greedy action over two dimensions of the observations. Cells are grey where all k
+    nearest points have the initial value.
 
-    :param model: a model of Box observations with at least two dimensions
+    :param model: a model with Box observations of at least two dimensions
     :param dims: the two dimensions, horizontal and vertical
-    :param fixed: where to hold other dimensions, observation units
+    :param fixed: values of other dimensions, observation units
     :param resolution: number of cells in each of the two dimensions
-    :param axes: where to draw, as many as :func:`count_panels` tells; a new figure if not given
-    :param names: what dimensions and actions are called; by default those in ``NAMES`` of the model's
-        environment, and numbers if it is not there
-    :param average: whether dimensions not in ``fixed`` are averaged over, see :func:`value_grid`; by default they are
-        held in the middle of their range
-    :return: the axes drawn on: value and action, of ExA one for each dimension of the action; :func:`figure_of` tells
+    :param axes: axes to draw on, :func:`count_panels` of them; a new figure if not given
+    :param names: names of the dimensions and actions; by default those of the model's environment in ``NAMES``, or
+        numbers if it is not there
+    :param average: whether to average over the dimensions not in ``fixed``, see :func:`value_grid`; by default they are
+        fixed in the middle of their range
+    :return: the axes of the value and the action (with ExA, of each dimension of the action); see :func:`figure_of` for
         their figure
     :raises ValueError: if the observations are not a Box of two or more dimensions, or ``dims``, ``fixed``,
         ``resolution``, ``axes`` or ``names`` do not fit
@@ -58,7 +58,7 @@ def plot_value_function(
         if caption:
             figure.suptitle(textwrap.fill(caption, 110), fontsize="medium", color="0.3")
     elif len(axes) != n_panels:
-        raise ValueError(f"axes must be {n_panels}, for the value and what there is of the action; got {len(axes)}")
+        raise ValueError(f"axes must be {n_panels}, one for the value and one per action panel; got {len(axes)}")
     value_axes, *action_axes = axes
     _draw_values(value_axes, grid)
     if isinstance(model.action_space, spaces.Box):
@@ -85,11 +85,11 @@ def plot_value_function(
 
 def plot_visits(counts: np.ndarray, extent: tuple[float, float, float, float], axes: Axes) -> Axes:
     """
-    Draw how often each cell was visited, on a logarithmic scale. Cells without a visit are grey.
+    Plot the number of visits of each cell on a logarithmic scale. Cells without visits are grey.
 
-    :param counts: shape (rows, columns), rows from bottom up
+    :param counts: number of visits, shape (rows, columns), rows from bottom up
     :param extent: (left, right, bottom, top), observation units
-    :param axes: where to draw
+    :param axes: axes to draw on
     :return: the same axes
     """
     from matplotlib.colors import LogNorm
@@ -111,12 +111,12 @@ def plot_visits(counts: np.ndarray, extent: tuple[float, float, float, float], a
 
 def plot_routes(routes: Sequence[np.ndarray], dims: tuple[int, int], axes: Axes) -> Axes:
     """
-    Draw the trajectories of episodes over what the axes already show, the latest brightest. A circle marks the start of
+    Plot the trajectories of episodes on top of the axes' content, the latest one brightest. A circle marks the start of
     an episode, a cross its end.
 
-    :param routes: the observations of each episode, shape (n_steps, obs_dim), the latest last
+    :param routes: the observations of each episode, shape (n_steps, obs_dim), the latest episode last
     :param dims: the two dimensions, horizontal and vertical
-    :param axes: where to draw; its range is kept
+    :param axes: axes to draw on; their range does not change
     :return: the same axes
     """
     from matplotlib.patheffects import withStroke
@@ -139,8 +139,8 @@ def plot_routes(routes: Sequence[np.ndarray], dims: tuple[int, int], axes: Axes)
 def count_panels(model: KNNAlgorithm) -> int:
     """
     :param model: any model
-    :return: how many axes :func:`plot_value_function` draws on: the value, and the action, of ExA one for each of its
-        dimensions
+    :return: number of axes that :func:`plot_value_function` draws on: one for the value and one for the action, with
+        ExA one for each dimension of the action
     """
     space = model.action_space
     return 2 if isinstance(space, spaces.Discrete) else 1 + int(np.prod(space.shape or ()))
@@ -148,9 +148,9 @@ def count_panels(model: KNNAlgorithm) -> int:
 
 def caption_of(grid: ValueGrid, names: Names) -> str:
     """
-    :param grid: what is drawn
-    :param names: what the dimensions are called
-    :return: the values of the dimensions that are not drawn; empty if there are none
+    :param grid: the plotted values
+    :param names: names of the dimensions
+    :return: a text with the values of the dimensions that are not plotted; empty if there are none
     """
     parts = [f"{names.observations[dim]} = {value:.3g}" for dim, value in grid.fixed.items()]
     caption = f"where {', '.join(parts)}" if parts else ""
@@ -163,7 +163,7 @@ def caption_of(grid: ValueGrid, names: Names) -> str:
 def _draw_values(axes: Axes, grid: ValueGrid) -> None:
     values = np.ma.masked_where(~grid.learned, grid.values)
     image = axes.imshow(values, origin="lower", extent=grid.extent, aspect="auto", cmap="viridis")
-    # ExA's is the mean of the neighbours' best values.
+    # With ExA, V(s) is the mean of the neighbours' best values.
     label = r"$V(s) = \max_a\,Q(s, a)$" if grid.actions.ndim == 2 else "$V(s)$"
     figure_of(axes).colorbar(image, ax=axes, label=label)
     axes.set_title("Value")
@@ -174,7 +174,7 @@ def _draw_actions(axes: Axes, grid: ValueGrid, names: Sequence[str]) -> None:
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
     n_actions = len(names)
-    # Evenly spaced in lightness: they can be told apart in grey and by colour-blind readers.
+    # Evenly spaced in lightness: distinguishable in greyscale and for colour-blind readers.
     colors = ListedColormap(matplotlib.colormaps["cividis"](np.linspace(0.08, 0.95, n_actions)))
     image = axes.imshow(
         np.ma.masked_where(~grid.learned, grid.actions),
