@@ -414,7 +414,7 @@ def test_a_checkpoint_imports_nothing(make_model: MakeModel, tmp_path: pathlib.P
     notes = {**NOTES, "algorithm": name, "wrappers": []}
     for path in tmp_path.glob("*.zip"):
         rewrite(path, lambda name, content: json.dumps(notes).encode() if name == "checkpoint.json" else content)
-    with pytest.raises(ValueError, match="import it first"):
+    with pytest.raises(ValueError, match="import its module first"):
         TableCheckpointCallback.resume(tmp_path, DriftEnv())
 
 

@@ -368,7 +368,7 @@ def test_a_death_ends_an_episode(make_mortal: Callable[..., RayVecEnv]) -> None:
     actions = np.zeros(2, int)
     venv.step(actions)
     before = venv.step(actions)[0]
-    with pytest.warns(UserWarning, match=r"environment 1 died and is made anew \(restart 1\): .*its worker process"):
+    with pytest.warns(UserWarning, match=r"environment 1 died and is restarted \(restart 1\): .*its worker process"):
         observations, rewards, dones, infos = venv.step(actions)
     # The other environment is not affected, and this one's episode is truncated at its last observation.
     assert (observations[0, 1], rewards.tolist(), dones.tolist()) == (3, [-1.0, 0.0], [False, True])
@@ -471,7 +471,7 @@ def test_learning_survives_a_process_and_a_node(cluster: Cluster, make_mortal: C
     assert doomed.node_id in venv.get_attr("node"), "environments are spread over the machines"
     model = KNNTD(VecMonitor(venv), points=(2, 11), bounds=([-1, 0], [0, 10]), gamma=1.0, seed=0)
     killer = Killer(venv, cluster, doomed)
-    with pytest.warns(UserWarning, match="is made anew"):
+    with pytest.warns(UserWarning, match="is restarted"):
         model.learn(400, callback=killer)
     assert model.num_timesteps == 400
     assert sum(killer.on_doomed) == 1

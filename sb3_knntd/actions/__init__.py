@@ -1,3 +1,3 @@
-"""From action values to an action."""
+"""Action selection and exploration."""
 
 from __future__ import annotations

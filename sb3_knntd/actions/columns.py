@@ -1,4 +1,4 @@
-"""The columns of the table as continuous actions."""
+"""The actions that the columns of the table stand for."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from gymnasium import spaces
 
 from sb3_knntd.common.checks import check_integer, check_numbers, check_size, check_word, in_bytes, shown
 
-#: ``action_table=None``: all combinations of the action points up to so many, one table a dimension beyond.
+#: ``action_table=None``: maximum number of columns of a joint table; with more combinations the table is factored.
 MOST_JOINT_COLUMNS = 128
-#: A row of more columns than this is refused: 8 MiB for each point that is visited.
+#: Maximum number of columns: a row takes 8 MiB for each visited point.
 MOST_COLUMNS = 2**20
 
 
 class ActionColumns(NamedTuple):
     """
-    What each column of the table stands for.
+    The actions that the columns of the table stand for.
 
-    :param points: its action, shape (n_columns, action_dim), action units; in a factored table zero in all but one
-        dimension
-    :param factors: where the columns of each action factor begin, and the end, shape (n_factors + 1,), int64
-    :param lists: the action points of each dimension, rising
+    :param points: the action of each column, shape (n_columns, action_dim), action units; in a factored table zero in
+        all but one dimension
+    :param factors: index of the first column of each action factor, and the number of columns, shape (n_factors + 1,),
+        int64
+    :param lists: the action points of each dimension, ascending
     """
 
     points: np.ndarray
@@ -35,7 +36,7 @@ class ActionColumns(NamedTuple):
 def discrete_columns(n_actions: int) -> ActionColumns:
     """
     :param n_actions: number of actions
-    :return: a column for each
+    :return: one column for each action
     """
     return ActionColumns(np.empty((n_actions, 0)), np.array([0, n_actions]), [])
 
@@ -43,19 +44,19 @@ def discrete_columns(n_actions: int) -> ActionColumns:
 def make_action_columns(action_space: spaces.Box, action_points: Any, action_table: str | None) -> ActionColumns:
     """
     :param action_space: Box with finite bounds
-    :param action_points: an int or one int a dimension for evenly spaced points over the space, or a list of arrays,
-        one a dimension (for one dimension an array will do), in action units
-    :param action_table: ``"joint"`` (a column for every combination), ``"factored"`` (columns for each dimension by
-        itself), or ``None``: joint up to 128 combinations
+    :param action_points: an int or one int per dimension for evenly spaced points over the space, or a list of one
+        array per dimension in action units (for one dimension, also the array itself)
+    :param action_table: ``"joint"`` (a column for every combination), ``"factored"`` (separate columns for each
+        dimension), or ``None``: joint up to 128 combinations
     :return: the columns
-    :raises ValueError: if the bounds are infinite, the points do not fit the space, or a joint table has more than 2²⁰
-        columns
+    :raises ValueError: if the bounds are infinite, the points do not fit the space, or a joint table would have more
+        than 2²⁰ columns
     """
     low, high = action_space.low.reshape(-1).astype(np.float64), action_space.high.reshape(-1).astype(np.float64)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(
             f"the action space must have finite bounds; got {action_space}. Bound it, e.g. by "
-            "gymnasium.wrappers.RescaleAction or a Box of your own"
+            "gymnasium.wrappers.RescaleAction or another Box"
         )
     lists = [
         _points_of_dimension(dimension, given, low[dimension], high[dimension], action_space.dtype)
@@ -86,7 +87,7 @@ def _by_dimension(action_points: Any, action_dim: int) -> list[Any]:
     if _is_single(action_points):
         return [check_integer("action_points", action_points, 2)] * action_dim
     given = list(action_points)
-    # For one dimension the list of points itself may stand for the list of lists.
+    # For one dimension, a plain list of points is accepted as well.
     if action_dim == 1 and given and all(map(_is_single, given)) and len(given) != 1:
         return [given]
     if len(given) != action_dim:
@@ -101,14 +102,14 @@ def _points_of_dimension(dimension: int, given: Any, low: float, high: float, dt
     name = f"action_points of dimension {dimension}"
     if _is_single(given):
         n_points = check_integer(name, given, 2)
-        # Each is a column of the table, and an action besides.
+        # Each point needs a column of the table, and its action.
         check_size(f"{name}: {n_points} points", 3 * 8 * n_points, "give fewer")
         return np.linspace(low, high, n_points)
     points = check_numbers(name, given)
     if points.ndim != 1 or len(points) == 0:
         raise ValueError(f"{name} must be a list of at least one number; got {shown(given)}")
-    # A bound of the space is what its type made of the number that was meant, 0.7 in float32 say. What the type cannot
-    # hold is no bound.
+    # The bounds of the space are rounded to its dtype, e.g. 0.7 to float32: points that round to a bound are equal to
+    # it. Points that overflow the dtype equal no bound.
     with np.errstate(over="ignore", invalid="ignore"):
         for bound in (low, high):
             points = np.where(points.astype(dtype) == bound, bound, points)
@@ -120,5 +121,5 @@ def _points_of_dimension(dimension: int, given: Any, low: float, high: float, dt
 
 
 def _is_single(value: Any) -> bool:
-    """Whether it is no array of any kind, nor a list that could be made one."""
+    """Whether the value is a scalar, not an array or a list."""
     return not isinstance(value, (list, tuple)) and np.ndim(value) == 0

@@ -1,4 +1,4 @@
-"""Exploration of discrete actions: from action values to an action."""
+"""Exploration policies for discrete actions."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def greedy(values: th.Tensor, ranks: th.Tensor | None = None) -> th.Tensor:
     The best action of each row.
 
     :param values: shape (..., n_actions)
-    :param ranks: uniform random numbers in [0, 1), shape (...), which of several equal best actions to take;
-        the first if not given
+    :param ranks: uniform random numbers in [0, 1) that break ties between best actions, shape (...); if not given, the
+        first is taken
     :return: shape (...), int64
     """
     best = values == values.amax(dim=-1, keepdim=True)
@@ -28,19 +28,19 @@ def greedy(values: th.Tensor, ranks: th.Tensor | None = None) -> th.Tensor:
 def pick(uniforms: th.Tensor, n: th.Tensor | int) -> th.Tensor:
     """
     :param uniforms: random numbers in [0, 1)
-    :param n: how many there are to pick from, at least 1
-    :return: integers in [0, n), as likely as each other, the shape of ``uniforms``
+    :param n: number of choices, at least 1
+    :return: uniformly distributed integers in [0, n), of the shape of ``uniforms``
     """
-    # The product can round up to n itself.
+    # The product may be rounded up to n.
     return (uniforms * n).long().clamp(max=n - 1) if isinstance(n, int) else th.minimum((uniforms * n).long(), n - 1)
 
 
 class ExplorationPolicy(Protocol):
     """A stochastic policy over action values. ``rate`` is ε or the temperature."""
 
-    #: what the kernels call it
+    #: the corresponding exploration of the kernels
     CODE: ClassVar[Exploration]
-    #: uniform random numbers that an action takes
+    #: number of uniform random numbers used for one action
     N_UNIFORMS: ClassVar[int]
 
     def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
@@ -48,7 +48,7 @@ class ExplorationPolicy(Protocol):
         :param values: action values, shape (batch, n_actions)
         :param uniforms: random numbers in [0, 1), shape (batch, N_UNIFORMS)
         :param rate: ε or the temperature
-        :param random_ties: whether equal best actions are drawn from; the first is taken otherwise
+        :param random_ties: whether ties between best actions are broken at random, otherwise the first is taken
         :return: actions, shape (batch,), int64
         """
         ...
@@ -63,7 +63,7 @@ class ExplorationPolicy(Protocol):
 
 
 class EpsilonGreedy:
-    """A uniformly random action with probability ε, else the best."""
+    """A uniformly random action with probability ε, otherwise the best one."""
 
     CODE: ClassVar[Exploration] = Exploration.EPSILON_GREEDY
     N_UNIFORMS: ClassVar[int] = 2
@@ -84,14 +84,14 @@ class Softmax:
 
     def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
         shares = th.softmax(values / rate, dim=-1).cumsum(dim=-1)
-        # Scaled by the last sum, which rounding may leave short of 1.
+        # Scale by the last sum, which may be less than 1 due to rounding.
         return (uniforms[:, :1] * shares[:, -1:] >= shares).sum(dim=-1).clamp(max=values.shape[-1] - 1)
 
     def expectation(self, values: th.Tensor, rate: float) -> th.Tensor:
         return (th.softmax(values / rate, dim=-1) * values).sum(dim=-1)
 
 
-#: How discrete actions can be explored, by the word that users pass.
+#: The exploration policies by the name that users pass.
 EXPLORATIONS: dict[str, type[ExplorationPolicy]] = {
     policy.CODE.name.lower(): policy for policy in (EpsilonGreedy, Softmax)
 }

@@ -1,4 +1,4 @@
-"""Action selection: from the values of the neighbours to an action, and what the state is worth."""
+"""Action selection: from the values of the neighbours to an action and the value of the state."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from sb3_knntd.kernels.selection import (
 
 class Selection(NamedTuple):
     """
-    An action for each row, with what learning needs to know of it.
+    The selected actions, and the values needed to learn from them.
 
-    :param actions: the action: its index, shape (batch,), int64, or a vector, shape (batch, action_dim)
-    :param action_indices: the columns of the table that each neighbour selects, one for each action factor, shape
-        (batch, k, n_factors), int64
-    :param target_values: the value of the state as a target, shape (batch,), the table's dtype
+    :param actions: indices of actions, shape (batch,), int64, or vectors, shape (batch, action_dim)
+    :param action_indices: the column that each neighbour selects for each action factor, shape (batch, k, n_factors),
+        int64
+    :param target_values: values of the states as targets, shape (batch,), the table's dtype
     """
 
     actions: th.Tensor
@@ -39,16 +39,17 @@ class Selection(NamedTuple):
 
 class ActionSelector(ABC):
     """
-    Selects actions from the rows of the neighbours. The kernels do the same by :meth:`kernel_arguments`.
+    Selects actions from the rows of the neighbours. With :meth:`kernel_arguments`, the kernels select in the same way.
 
-    :param columns: what each column of the table stands for
-    :param random_ties: whether one of several equal best actions is drawn while training, in place of the first
+    :param columns: the actions that the columns of the table stand for
+    :param random_ties: whether ties between best actions are broken at random while training, otherwise the first is
+        taken
     """
 
-    #: uniform random numbers that a selection takes
+    #: number of uniform random numbers used for one selection
     n_uniforms: int
     _COMBINATION: ClassVar[Combination]
-    #: the exploration whose rate of 0 is the greedy policy
+    #: an exploration that is greedy at a rate of 0
     _GREEDY_EXPLORATION: ClassVar[Exploration]
     target = Target.SARSA
     exploration: Exploration
@@ -76,8 +77,8 @@ class ActionSelector(ABC):
 
     def kernel_arguments(self, greedy: bool = False) -> SelectionArguments:
         """
-        :param greedy: whether to leave exploration out and to take the first of equal actions
-        :return: what the kernels need to select in the same way; with ``greedy`` at a rate of 0
+        :param greedy: whether to select greedily, the first of equal actions
+        :return: arguments with which the kernels select in the same way; with ``greedy``, call them with a rate of 0
         """
         return SelectionArguments(
             combination=int(self._COMBINATION),
@@ -92,13 +93,13 @@ class ActionSelector(ABC):
 
     def persist(self, persistent: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
         """
-        What is being explored after a further step.
+        Keep or redraw the persistent actions for the next step.
 
         :param persistent: the columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (batch, n_factors), int64
         :param uniforms: random numbers in [0, 1), shape (batch, n_uniforms)
         :param rate: ε or the temperature
-        :param lengths: number of steps that each episode is taken to last, shape (batch,)
-        :return: the same, shape (batch, n_factors)
+        :param lengths: expected length of each episode, steps, shape (batch,)
+        :return: the new persistent actions, shape (batch, n_factors), int64
         """
         return persistent
 
@@ -107,7 +108,7 @@ class ActionSelector(ABC):
         self, rows: th.Tensor, probabilities: th.Tensor, uniforms: th.Tensor, rate: float, persistent: th.Tensor
     ) -> Selection:
         """
-        The action to take while training.
+        Select the actions to take while training.
 
         :param rows: table rows of the neighbours, shape (batch, k, n_actions)
         :param probabilities: of the neighbours, shape (batch, k), the table's dtype
@@ -139,7 +140,7 @@ class ActionSelector(ABC):
     @abstractmethod
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
         """
-        The columns that stand for given actions, or come closest to them.
+        The columns of given actions, or of the nearest action points.
 
         :param actions: indices of actions, shape (n,), or vectors, shape (n, action_dim), action units
         :return: shape (n, n_factors), int64
@@ -149,7 +150,7 @@ class ActionSelector(ABC):
     @abstractmethod
     def value(self, rows: th.Tensor, probabilities: th.Tensor, action_indices: th.Tensor) -> th.Tensor:
         """
-        What a state and the action taken in it are worth by the table as it is (eqs. 8 and 25).
+        The current value of a state and the action taken in it (eqs. 8 and 25).
 
         :param rows: table rows of the neighbours, shape (batch, k, n_actions)
         :param probabilities: of the neighbours, shape (batch, k), the table's dtype
@@ -160,7 +161,7 @@ class ActionSelector(ABC):
     @abstractmethod
     def greedy_value(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
         """
-        What a state is worth if the greedy action is taken (eqs. 12 and 25).
+        The value of a state if the greedy action is taken (eqs. 12 and 25).
 
         :param rows: table rows of the neighbours, shape (batch, k, n_actions)
         :param probabilities: of the neighbours, shape (batch, k)
@@ -169,7 +170,7 @@ class ActionSelector(ABC):
 
     def given_value(self, rows: th.Tensor, probabilities: th.Tensor, columns: th.Tensor) -> th.Tensor:
         """
-        What a state and one given action for all neighbours are worth.
+        The value of a state and a given action, the same for all neighbours.
 
         :param rows: table rows of the neighbours, shape (batch, k, n_actions)
         :param probabilities: of the neighbours, shape (batch, k)
@@ -183,7 +184,7 @@ class ActionSelector(ABC):
 
     def random_columns(self, uniforms: np.ndarray) -> np.ndarray:
         """
-        Columns drawn at random.
+        Draw columns uniformly at random.
 
         :param uniforms: random numbers in [0, 1), shape (batch, n_factors)
         :return: a column for each action factor, shape (batch, n_factors), int64
@@ -209,9 +210,10 @@ class MeanValueSelector(ActionSelector):
     kNN-TD: the neighbours' values are averaged, and one action is selected from the mean (eqs. 8 to 12).
 
     :param columns: one for each action
-    :param target: the value of the next state
+    :param target: kind of the target value
     :param exploration: the policy while training
-    :param random_ties: whether one of several equal best actions is drawn while training, in place of the first
+    :param random_ties: whether ties between best actions are broken at random while training, otherwise the first is
+        taken
     """
 
     _COMBINATION = Combination.OF_VALUES
@@ -227,7 +229,7 @@ class MeanValueSelector(ActionSelector):
         self.n_uniforms = exploration.N_UNIFORMS
 
     def kernel_arguments(self, greedy: bool = False) -> SelectionArguments:
-        # Inherited, the code would have the kernels explore as the parent class does.
+        # An inherited CODE would make the kernels explore like the parent class.
         if not greedy and "CODE" not in vars(type(self.policy)):
             raise ValueError(
                 f"the compiled step does not know the exploration {type(self.policy).__name__}: its CODE must be set "
@@ -273,21 +275,23 @@ class MeanValueSelector(ActionSelector):
         return mean_rows(rows, probabilities).amax(dim=1)
 
     def given_value(self, rows: th.Tensor, probabilities: th.Tensor, columns: th.Tensor) -> th.Tensor:
-        # Rounded as the greedy value is, with which it is compared.
+        # Same rounding as in greedy_value, with which it is compared.
         return mean_rows(rows, probabilities).gather(1, columns)[:, 0]
 
 
 class MeanActionSelector(ActionSelector):
     """
     Ex⟨a⟩: each neighbour selects the best action of its own row, and the mean of these actions is taken (eqs. 19 to
-    21). The state is worth the mean of the neighbours' best values (eq. 25).
+    21). The value of the state is the mean of the neighbours' best values (eq. 25).
 
     :param columns: the action points, in columns for each action factor
-    :param exploration: ``SHARED``: all neighbours explore the same column; ``PER_NEIGHBOR``: each by itself (eq. 27)
-    :param min_persistence: mean number of steps, at least, for which a shared draw is kept
-    :param persistence_share: or this share of an episode, if that is longer
+    :param exploration: ``SHARED``: all neighbours explore the same column; ``PER_NEIGHBOR``: each draws its own (eq.
+        27)
+    :param min_persistence: lower limit of the mean number of steps for which a shared draw is kept
+    :param persistence_share: share of an episode for which a shared draw is kept on average, if that is longer
     :param n_neighbors: k
-    :param random_ties: whether one of several equal best columns is drawn while training, in place of the first
+    :param random_ties: whether ties between best columns are broken at random while training, otherwise the first is
+        taken
     """
 
     _COMBINATION = Combination.OF_ACTIONS
@@ -307,7 +311,8 @@ class MeanActionSelector(ActionSelector):
         self.min_persistence = float(min_persistence)
         self.persistence_share = float(persistence_share)
         n_factors, shared = self.n_factors, exploration is Exploration.SHARED
-        #: redraw, explore, column of each factor, tie of each neighbour and factor, and whether each of these explores
+        #: number of uniforms for: redraw, explore, column of each factor, tie of each neighbour and factor, and whether
+        #: each neighbour explores each factor
         self._parts = [1, 1, n_factors, n_neighbors * n_factors, 0 if shared else n_neighbors * n_factors]
         self.n_uniforms = sum(self._parts)
         self._points = th.from_numpy(columns.points)

@@ -1,3 +1,3 @@
-"""What every part uses: checks, files, schedules, random numbers."""
+"""Used by all other packages: checks, files, schedules, random numbers."""
 
 from __future__ import annotations

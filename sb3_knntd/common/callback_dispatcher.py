@@ -1,4 +1,4 @@
-"""When which callbacks are called during training."""
+"""Calling of callbacks during training."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Conve
 class BatchedCallback(BaseCallback):
     """
     A callback that KNNTD and ExA call once for many steps, which takes a hundredth of the time of calling it at every
-    step. It is called when it is due and when an episode ends. ``n_calls``, ``num_timesteps`` and ``locals`` are then
-    those of the last step, as with other algorithms or below other callbacks.
+    step. It is called when it is due and when an episode ends, with the ``n_calls``, ``num_timesteps`` and ``locals``
+    of the last step. Other algorithms and callbacks call it at every step.
     """
 
     #: the value of ``n_calls`` at which it is due; set it when training begins and in each call
@@ -22,8 +22,8 @@ class BatchedCallback(BaseCallback):
 
     def recorder(self) -> Callable[[np.ndarray], object] | None:
         """
-        :return: a function that is given the observations of every step, shape (n_envs, *obs_shape); ``None`` if no
-            observations are needed
+        :return: a function to call with the observations of every step, shape (n_envs, *obs_shape); ``None`` if the
+            callback needs no observations
         """
         return None
 
@@ -51,7 +51,7 @@ class CallbackDispatcher:
     """
 
     def __init__(self, callback: BaseCallback) -> None:
-        #: all callbacks, and the lists that hold them
+        #: all callbacks, including lists of callbacks
         self.callbacks = list(_flatten(callback))
         lists = [each for each in self.callbacks if type(each) is CallbackList]
         self._batched = [each for each in self.callbacks if isinstance(each, BatchedCallback)]
@@ -120,7 +120,7 @@ class CallbackDispatcher:
 
 
 def _flatten(callback: BaseCallback) -> Iterator[BaseCallback]:
-    """The callback and, if it is a list, all in it, without SB3's placeholder for no callback."""
+    """The callback and, if it is a list, all callbacks in it, without SB3's placeholder for no callback."""
     if not (isinstance(callback, ConvertCallback) and callback.callback is None):
         yield callback
     if type(callback) is CallbackList:

@@ -1,4 +1,4 @@
-"""Checks of what a user passes in. Each names the argument, the value given and what would do."""
+"""Validation of arguments. Error messages name the argument, the given value and what is valid."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ import numpy as np
 
 Member = TypeVar("Member", bound=Enum)
 
-#: The least number that is taken where one is to be above 0 and is divided by: its square and quotients stay numbers.
+#: Lower limit of positive numbers that are used as divisors: their squares and quotients stay finite.
 LEAST = 1e-100
-#: A count beyond this has no place in 64 bits.
+#: The largest 64-bit integer.
 LARGEST_COUNT = 2**63 - 1
-#: What would take more bytes than this is refused rather than begun.
+#: Limit of memory, in bytes, for a single object.
 LARGEST_SIZE = 2**32
-#: Longer values are cut off in a message.
+#: Longer values are truncated in messages, characters.
 LONGEST = 300
-#: Where a schedule is looked at before it is used: at its beginning, middle and end.
+#: Values of the remaining progress at which a schedule is checked: at its beginning, middle and end.
 PROGRESS = (1.0, 0.5, 0.0)
 
 
 def shown(value: Any) -> str:
     """
-    :param value: what was given
-    :return: how a message shows it, cut off if it is long
+    :param value: any value
+    :return: its text for a message, truncated if it is long
     """
     try:
         text = repr(value)
-    except ValueError:  # Python does not write out integers of thousands of digits.
+    except ValueError:  # Python refuses to convert integers of thousands of digits
         text = f"{type(value).__name__} of too many digits to show"
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
@@ -41,8 +41,8 @@ def shown(value: Any) -> str:
 def check_word(name: str, value: Any, words: Iterable[str]) -> None:
     """
     :param name: name of the argument
-    :param value: what was given
-    :param words: what is allowed
+    :param value: the given value
+    :param words: allowed strings
     :raises ValueError: if ``value`` is none of ``words``
     """
     allowed = list(words)
@@ -54,7 +54,7 @@ def check_member(name: str, value: Any, members: Iterable[Member]) -> Member:
     """
     :param name: name of the argument
     :param value: a member of an enumeration, or its name in lower case
-    :param members: what is allowed
+    :param members: allowed members
     :return: the member
     :raises ValueError: if ``value`` is none of ``members``
     """
@@ -67,7 +67,7 @@ def check_member(name: str, value: Any, members: Iterable[Member]) -> Member:
 def check_flag(name: str, value: Any) -> bool:
     """
     :param name: name of the argument
-    :param value: what was given
+    :param value: the given value
     :return: the value as a bool
     :raises ValueError: if ``value`` is neither ``True`` nor ``False``
     """
@@ -78,7 +78,7 @@ def check_flag(name: str, value: Any) -> bool:
 
 def check_verbose(value: Any) -> int:
     """
-    :param value: what was given as ``verbose``
+    :param value: value given for ``verbose``
     :return: the value as an int, 1 for ``True``
     :raises ValueError: if it is neither an integer >= 0 nor a bool
     """
@@ -90,7 +90,7 @@ def check_number(
 ) -> float:
     """
     :param name: name of the argument
-    :param value: what was given
+    :param value: the given value
     :param low: lowest value allowed, or with ``above`` the value it must exceed
     :param high: highest value allowed
     :param above: whether ``low`` itself is excluded
@@ -109,14 +109,14 @@ def check_number(
 def check_integer(name: str, value: Any, low: int, high: int = LARGEST_COUNT) -> int:
     """
     :param name: name of the argument
-    :param value: what was given
+    :param value: the given value
     :param low: lowest value allowed
     :param high: highest value allowed
     :return: the value as an int
     :raises ValueError: if ``value`` is not an integer within the limits
     """
     number = _real(value)
-    # NaN and infinity are no integers, and have none.
+    # int() raises for NaN and infinity.
     whole = isinstance(number, int) or (math.isfinite(number) and int(number) == number)
     if not (whole and low <= number <= high):
         wanted = f">= {low}" if high == LARGEST_COUNT else f"from {low} to {high}"
@@ -128,15 +128,15 @@ def check_integer(name: str, value: Any, low: int, high: int = LARGEST_COUNT) ->
 def check_numbers(name: str, value: Any) -> np.ndarray:
     """
     :param name: name of the argument
-    :param value: what was given
+    :param value: the given value
     :return: the value as an array, float64
-    :raises ValueError: if ``value`` is not an array of numbers, or cannot be made one
+    :raises ValueError: if ``value`` cannot be converted to an array of numbers
     """
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{name} must be an array of numbers; got {shown(value)}") from error
-    # Signed, unsigned and floating: no words, no truth values, nothing complex.
+    # Integers and floats: no strings, no booleans, no complex numbers.
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name} must be an array of numbers; got {shown(value)}")
     return array.astype(np.float64)
@@ -144,9 +144,9 @@ def check_numbers(name: str, value: Any) -> np.ndarray:
 
 def check_finite(what: str, values: np.ndarray, envs: Sequence[int]) -> None:
     """
-    :param what: what the values are
-    :param values: a row for each of ``envs``
-    :param envs: the environments that returned them
+    :param what: what the values are, for the message
+    :param values: one row for each of ``envs``
+    :param envs: indices of the environments that returned them
     :raises ValueError: if a value is not finite; the message says where
     """
     finite = np.isfinite(values)
@@ -188,7 +188,7 @@ def check_schedule(
 def check_path(name: str, value: Any) -> Path:
     """
     :param name: name of the argument
-    :param value: what was given
+    :param value: the given value
     :return: the value as a path
     :raises ValueError: if ``value`` is no path
     """
@@ -200,7 +200,7 @@ def check_path(name: str, value: Any) -> Path:
 def check_name(name: str, value: Any) -> str:
     """
     :param name: name of the argument
-    :param value: what was given
+    :param value: the given value
     :return: the value
     :raises ValueError: if ``value`` cannot be part of a file's name
     """
@@ -211,12 +211,12 @@ def check_name(name: str, value: Any) -> str:
 
 def check_size(what: str, n_bytes: int, advice: str) -> None:
     """
-    Refuse what would take the machine's memory, before it is begun.
+    Check that an object would fit into memory, before it is created.
 
-    :param what: name of the argument, and what it would need the memory for
-    :param n_bytes: how many bytes that would take
-    :param advice: what to give instead
-    :raises ValueError: if that is more than :data:`LARGEST_SIZE`
+    :param what: name of the argument, and the object that needs the memory
+    :param n_bytes: size of the object, bytes
+    :param advice: what to pass instead
+    :raises ValueError: if ``n_bytes`` exceeds :data:`LARGEST_SIZE`
     """
     if n_bytes > LARGEST_SIZE:
         raise ValueError(f"{what} would take {in_bytes(n_bytes)}, more than {in_bytes(LARGEST_SIZE)}: {advice}")
@@ -224,13 +224,13 @@ def check_size(what: str, n_bytes: int, advice: str) -> None:
 
 def in_bytes(number: int) -> str:
     """
-    :param number: a number of bytes
-    :return: the same in the unit that it is easily read in
+    :param number: number of bytes
+    :return: the same as text, in a suitable unit
     """
     units = ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB")
     power = max(number.bit_length() - 1, 0) // 10
     if power >= len(units):
-        # Combinations can be more than a float holds.
+        # A number of combinations can be too large for a float.
         return f"{Decimal(number):.2e} bytes"
     return f"{number / 1024**power:,.4g} {units[power]}"
 
@@ -240,7 +240,7 @@ def _range(low: float, high: float, above: bool) -> str:
 
 
 def _real(value: Any) -> Any:
-    """The int or float that ``value`` is, also as an array or a tensor of no axes; NaN for all else."""
+    """The int or float ``value``, unpacked from a 0-d array or tensor; NaN for anything else."""
     if getattr(value, "shape", None) == () and hasattr(value, "item"):
         value = value.item()
     return value if isinstance(value, (int, float, np.floating)) and not isinstance(value, bool) else math.nan

@@ -1,4 +1,4 @@
-"""What the commands of ``sb3-knntd`` share: their parser, the types of their arguments, and how they fail."""
+"""Shared by the commands of ``sb3-knntd``: the parser, types of arguments, and error handling."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ INTERRUPTED = 130
 
 
 class CommandError(Exception):
-    """What was asked for cannot be done. The user is shown the message alone, without a traceback."""
+    """A command cannot be carried out. The user sees only the message, without a traceback."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Reports a mistake in one line: with the usage before it the reason would be hard to see."""
+    """Reports errors in one line, without argparse's usage, which would hide the reason."""
 
     def error(self, message: str) -> NoReturn:
         """
@@ -39,8 +39,8 @@ class Parser(argparse.ArgumentParser):
 
 def reason_of(error: Exception) -> str:
     """
-    :param error: what was raised
-    :return: what it says; with its type, unless it was written for users to read
+    :param error: an exception
+    :return: its message; preceded by its type, unless the type is one whose messages are meant for users
     """
     from gymnasium.error import Error
 
@@ -53,7 +53,7 @@ def make_env(env_id: str) -> gym.Env[Any, Any]:
     """
     :param env_id: gymnasium id
     :return: the environment
-    :raises CommandError: if it cannot be made, whatever it raises
+    :raises CommandError: if making it raises any exception
     """
     import gymnasium as gym
 
@@ -66,8 +66,8 @@ def make_env(env_id: str) -> gym.Env[Any, Any]:
 def positive_int(text: str) -> int:
     """
     :param text: argument of the command line
-    :return: the integer it is
-    :raises argparse.ArgumentTypeError: if it is none, or less than 1
+    :return: its value
+    :raises argparse.ArgumentTypeError: if it is no integer, or less than 1
     """
     try:
         number = int(text)
@@ -81,8 +81,8 @@ def positive_int(text: str) -> int:
 def seed_int(text: str) -> int:
     """
     :param text: argument of the command line
-    :return: the integer it is
-    :raises argparse.ArgumentTypeError: if it is none, or no seed NumPy takes
+    :return: its value
+    :raises argparse.ArgumentTypeError: if it is no integer in [0, 2³¹)
     """
     try:
         number = int(text)
@@ -96,8 +96,8 @@ def seed_int(text: str) -> int:
 def positive_float(text: str) -> float:
     """
     :param text: argument of the command line
-    :return: the number it is
-    :raises argparse.ArgumentTypeError: if it is none, infinite, or not above 0
+    :return: its value
+    :raises argparse.ArgumentTypeError: if it is no number, infinite, or not above 0
     """
     try:
         number = float(text)
@@ -126,21 +126,23 @@ def chosen_seeds(args: argparse.Namespace) -> range:
 
 def run_resumable(command: Callable[[], int], out: Path) -> int:
     """
-    :param command: keeps what is finished
-    :param out: where
-    :return: its exit code, or that of an interruption, of which the user is told
+    Run a command, and tell the user how to resume it if it is interrupted.
+
+    :param command: stores finished results in ``out``
+    :param out: folder of the results
+    :return: its exit code, or :data:`INTERRUPTED`
     """
     try:
         return command()
     except KeyboardInterrupt:
-        print(f"\nInterrupted. What is finished is in {out}: the same command goes on from there.", file=sys.stderr)
+        print(f"\nInterrupted. Finished results are in {out}: the same command goes on from there.", file=sys.stderr)
         return INTERRUPTED
 
 
 def require(*modules: str, extra: str = "extra") -> None:
     """
-    :param modules: modules that the command cannot do without
-    :param extra: extra of this package that installs them
+    :param modules: modules that the command needs
+    :param extra: the extra of this package that installs them
     :raises CommandError: if some of them are not installed
     """
     missing = [module for module in modules if find_spec(module) is None]
@@ -150,10 +152,10 @@ def require(*modules: str, extra: str = "extra") -> None:
 
 def run_commands(commands: Sequence[AddCommand], argv: Sequence[str] | None = None, prog: str = "sb3-knntd") -> int:
     """
-    Parse a command line and run the command that it names.
+    Parse the command line and run the command.
 
-    :param commands: each adds one command or several: the parser, and with ``set_defaults(run=...)`` the function that
-        runs it and returns the exit code
+    :param commands: functions that each add one or more commands: a subparser, whose default ``run`` is the function
+        that runs the command and returns its exit code
     :param argv: arguments of the command line, without the program's name; by default those of this process
     :param prog: the program's name
     :return: exit code
@@ -161,7 +163,7 @@ def run_commands(commands: Sequence[AddCommand], argv: Sequence[str] | None = No
     """
     parser = Parser(prog=prog, description="kNN-TD(λ) for Stable-Baselines3: a table at k nearest points, no network.")
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('sb3-knntd')}")
-    parser.add_argument("--traceback", action="store_true", help="show where an error came from, not its reason alone")
+    parser.add_argument("--traceback", action="store_true", help="show the traceback of an error, not only its message")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
     for add_command in commands:
         add_command(subparsers)

@@ -1,4 +1,4 @@
-"""Tables of results as CSV files."""
+"""Write tables as CSV."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 def csv_table(header: Sequence[str], rows: Iterable[Iterable[Any]]) -> bytes:
     """
     :param header: names of the columns
-    :param rows: as many values each; ``None`` leaves a cell empty
+    :param rows: one value for each column; ``None`` for an empty cell
     :return: the content of a CSV file, lines ending in ``\\n``
     """
     text = io.StringIO()

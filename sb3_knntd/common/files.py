@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Atomic writing of files, and checks of saved models."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-# Windows has no such locks, and needs none: nobody can remove there what another has open.
+# Windows has no fcntl and needs no lock: there, a file that is open in another process cannot be removed.
 if sys.platform != "win32":
     import fcntl
 
-#: What an unfinished file is called: after the file that it is to be, and a number of its own.
+#: Pattern of a temporary file's name: the name of the target, and a random number.
 UNFINISHED = re.compile(r"\.(.+)\.[0-9a-f]{16}\.part")
-#: A name of more bytes than this leaves no room for the rest, and a hash stands for it.
+#: Longer names, in bytes, are replaced by a hash, so that the temporary name stays within the limit of file systems.
 LONGEST_NAME = 100
-#: A file may unfold to so many bytes, or to so many times its size. SB3 and torch write what they save uncompressed.
+#: A file may unpack to this many bytes, or to this many times its size. SB3 and torch save without compression.
 LARGEST_UNFOLDED = 2**26
 LARGEST_RATIO = 20
 
@@ -32,13 +32,14 @@ LARGEST_RATIO = 20
 @contextmanager
 def replacing(path: str | Path) -> Iterator[io.BufferedRandom]:
     """
-    Write a file beside its place. It is moved there when it is whole and on the disk; if writing fails, what was there
-    stays. A link stays a link, and what it leads to is written; a file that was there keeps its permissions.
+    Write a file atomically: to a temporary file beside the target, which replaces the target once it is complete and on
+    disk. If writing fails, the old file is kept. A symbolic link is followed, and an existing file keeps its
+    permissions.
 
-    What killed processes have left unfinished is removed by the next that writes the same file, or one whose name
-    differs only in numbers. An unfinished file of a process that lives is locked, and left alone.
+    Temporary files of killed processes are removed by the next write of the same file, or of one whose name differs
+    only in numbers. Those of running processes are locked and are kept.
 
-    :param path: its place
+    :param path: the target
     :return: the file to write to
     """
     target = Path(os.path.realpath(path))
@@ -52,9 +53,9 @@ def replacing(path: str | Path) -> Iterator[io.BufferedRandom]:
             file.flush()
             os.fsync(file.fileno())
             if sys.platform != "win32":
-                # While it is still locked, or another process could take it for left.
+                # Replace before the lock is released; otherwise another process could remove the file as a leftover.
                 os.replace(beside, target)
-        if sys.platform == "win32":  # Windows does not move what is open
+        if sys.platform == "win32":  # Windows cannot move an open file
             os.replace(beside, target)
     except BaseException:
         beside.unlink(missing_ok=True)
@@ -63,17 +64,17 @@ def replacing(path: str | Path) -> Iterator[io.BufferedRandom]:
 
 def replace_file(path: str | Path, content: bytes) -> None:
     """
-    Write a file, as :func:`replacing` does.
+    Write a file atomically, see :func:`replacing`.
 
-    :param path: its place
-    :param content: all of it
+    :param path: the target
+    :param content: the whole content
     """
     with replacing(path) as file:
         file.write(content)
 
 
 def _begin(target: Path) -> tuple[Path, io.BufferedRandom]:
-    """An unfinished file of this process, and its path."""
+    """Open and lock a new temporary file; its path and the file."""
     while True:
         beside = target.with_name(f".{_short(target.name)}.{secrets.token_hex(8)}.part")
         file = open(beside, "x+b")  # noqa: SIM115
@@ -83,7 +84,7 @@ def _begin(target: Path) -> tuple[Path, io.BufferedRandom]:
         except BlockingIOError:  # another process is about to remove it
             file.close()
             continue
-        except OSError:  # a file system without locks, where nothing is removed either
+        except OSError:  # a file system without locks; leftovers are not removed there either
             return beside, file
         if beside.exists():
             return beside, file
@@ -92,9 +93,9 @@ def _begin(target: Path) -> tuple[Path, io.BufferedRandom]:
 
 def sweep(target: Path) -> None:
     """
-    Remove what killed processes have left unfinished.
+    Remove the temporary files of killed processes.
 
-    :param target: the place of a file; those go that were to be this one, or one whose name differs only in numbers
+    :param target: a file; temporary files of it, and of files whose names differ only in numbers, are removed
     """
     kind = _kind(_short(target.name))
     with suppress(OSError):
@@ -105,7 +106,7 @@ def sweep(target: Path) -> None:
 
 
 def _remove_left(path: Path) -> None:
-    """Remove a file that no living process is writing."""
+    """Remove a temporary file, unless a running process is writing it."""
     with suppress(OSError):
         if sys.platform == "win32":
             path.unlink()
@@ -126,12 +127,12 @@ def _kind(name: str) -> str:
 
 def read_description(path: str | Path | io.BufferedIOBase) -> dict[str, Any]:
     """
-    Read what a file that SB3 has saved says of its content, without unpickling anything, and check that it is whole.
+    Read the JSON part of a file saved by SB3, without unpickling anything, and check that the file is complete.
 
     :param path: file, with or without ``.zip``, or file-like object
-    :return: what JSON holds of it
+    :return: the content of its JSON part
     :raises FileNotFoundError: if there is no such file
-    :raises ValueError: if it is damaged, cut off, something else, or unfolds to far more than its size
+    :raises ValueError: if it is damaged, truncated, not a saved model, or unpacks to far more than its size
     """
     file: Any = path
     if isinstance(path, (str, Path)):
@@ -144,10 +145,10 @@ def read_description(path: str | Path | io.BufferedIOBase) -> dict[str, Any]:
             _check_unfolded_size(path, archive)
             damaged = archive.testzip()
             if damaged is not None:
-                raise ValueError(f"{path} is damaged: {damaged} in it is not what was written")
+                raise ValueError(f"{path} is damaged: its member {damaged} has a wrong checksum")
             data = json.loads(archive.read("data"))
             if not isinstance(data, dict):
-                raise ValueError(f"{path} is no saved model: what it says of its parameters is {data!r}")
+                raise ValueError(f"{path} is no saved model: its parameters must be a dict; got {data!r}")
             if data.get("algorithm"):
                 archive.getinfo("policy.pth"), archive.getinfo("learner.pth")
     except (zipfile.BadZipFile, KeyError, UnicodeDecodeError, json.JSONDecodeError, EOFError, RecursionError) as error:
@@ -159,11 +160,11 @@ def read_description(path: str | Path | io.BufferedIOBase) -> dict[str, Any]:
 
 
 def _check_unfolded_size(path: object, archive: zipfile.ZipFile) -> None:
-    """Refuse what would fill the memory: neither SB3 nor torch compress what they save."""
+    """Refuse a file that would fill the memory. Neither SB3 nor torch compresses what it saves."""
     folded, unfolded = 0, 0
     for member in archive.infolist():
         folded, unfolded = folded + member.compress_size, unfolded + member.file_size
-    # Members may share their bytes, so that the sum of what they take says too much.
+    # Members may overlap in the file, so the sum of their sizes may exceed the size of the file.
     assert archive.fp is not None
     folded = min(folded, archive.fp.seek(0, os.SEEK_END))
     _refuse_bomb(path, folded, unfolded)
@@ -176,6 +177,6 @@ def _check_unfolded_size(path: object, archive: zipfile.ZipFile) -> None:
 def _refuse_bomb(path: object, folded: int, unfolded: int) -> None:
     if unfolded > max(LARGEST_UNFOLDED, LARGEST_RATIO * folded):
         raise ValueError(
-            f"{path} would unfold from {folded:,} to {unfolded:,} bytes: saved models are not compressed. If it is one "
-            "of yours that was compressed, unpack it and pack it anew without compression"
+            f"{path} would unfold from {folded:,} to {unfolded:,} bytes: saved models are not compressed. If you "
+            "compressed it yourself, unpack it and pack it again without compression"
         )

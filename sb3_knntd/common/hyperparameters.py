@@ -1,4 +1,4 @@
-"""Arguments of an algorithm that apply when they are set later, or say that they cannot."""
+"""Hyperparameters of an algorithm as descriptors, which apply or refuse changes after construction."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import Any, Protocol
 
 
 class Configurable(Protocol):
-    """What has such arguments."""
+    """A class with hyperparameters."""
 
-    #: whether the arguments have been used to build the model
+    #: whether the model has been built
     _is_set_up: bool
 
     def _reconfigure(self) -> None:
-        """Check all arguments, and go on with them."""
+        """Check all hyperparameters and apply them."""
 
 
 class Hyperparameter:
-    """An argument that can be set at any time, and applies from the next step on."""
+    """A hyperparameter that can be set at any time and applies from the next step on."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -43,7 +43,7 @@ class Hyperparameter:
 
 
 class FixedHyperparameter(Hyperparameter):
-    """An argument that the table was built with, and that cannot be set afterwards."""
+    """A hyperparameter that determines how the table is built and cannot be set afterwards."""
 
     def __set__(self, model: Configurable, value: Any) -> None:
         if getattr(model, "_is_set_up", False):

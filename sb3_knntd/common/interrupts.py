@@ -1,4 +1,4 @@
-"""Short work that Ctrl-C must not cut in two."""
+"""Short critical sections that Ctrl-C must not interrupt."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Let Ctrl-C take effect afterwards. Other threads than the main one are never interrupted."""
+    """Delay Ctrl-C until the block ends. Only the main thread is ever interrupted."""
     handler = signal.getsignal(signal.SIGINT)
-    # What was set outside of Python could not be set again.
+    # A handler installed outside Python (None) could not be restored.
     if handler is None or threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,6 +1,6 @@
 """
-Objects as what JSON can hold, and back, where pickle would run what a file says. What is made of a file is numbers,
-arrays, spaces, SB3's schedules, and classes that the program has imported already.
+Convert objects to JSON values and back, as a safe alternative to pickle, which executes code from the file. Supported
+are numbers, arrays, spaces, SB3's schedules, and policy classes that are already imported.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-#: What marks an object that JSON has no form for. No key of an ordinary dict begins with it.
+#: Key that marks an encoded object. No key of an ordinary dict begins with it.
 MARK = ":plain:"
-#: Where SB3 keeps what it has pickled.
+#: Key of the pickle in SB3's format.
 PICKLED = ":serialized:"
-#: Types of numbers that an array may be of.
+#: Kinds of NumPy dtypes that arrays may have.
 NUMBERS = "biufc"
 
 
 def encode(value: Any) -> Any:
     """
     :param value: any object
-    :return: what :func:`decode` makes an equal one of, of what JSON can hold
-    :raises TypeError: if it has to be pickled
+    :return: a JSON value from which :func:`decode` makes an equal object
+    :raises TypeError: if the object can only be pickled
     """
     if value is None or type(value) in (bool, int, float, str):
         return value
@@ -53,9 +53,9 @@ def encode(value: Any) -> Any:
 
 def decode(value: Any) -> Any:
     """
-    :param value: what :func:`encode` returned, or what somebody made up
-    :return: the object; nothing is run or imported
-    :raises ValueError: if there is none
+    :param value: a value that :func:`encode` returned, or an untrusted one
+    :return: the object; nothing is executed or imported
+    :raises ValueError: if the value is invalid
     """
     if isinstance(value, list):
         return [decode(item) for item in value]
@@ -84,7 +84,7 @@ def decode(value: Any) -> Any:
 def encodable(values: Mapping[str, Any]) -> dict[str, Any]:
     """
     :param values: objects by name
-    :return: the code of those that need not be pickled
+    :return: the encoded objects, without those that can only be pickled
     """
     codes = {}
     for name, value in values.items():
@@ -97,13 +97,13 @@ def encodable(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def objects_for(path: object, description: Mapping[str, Any], given: Iterable[str] = ()) -> dict[str, Any]:
     """
-    The objects to take in place of all that is pickled in a file of SB3's form.
+    The objects that replace the pickled ones in a file of SB3's format.
 
     :param path: the file, for the message
-    :param description: what JSON holds of it; under ``plain`` the code of what is pickled
-    :param given: names of objects that the caller has
-    :return: the others, by name
-    :raises ValueError: if one of them is there only as a pickle
+    :param description: the JSON part of the file; its entry ``plain`` holds the encoded objects
+    :param given: names of objects that the caller provides
+    :return: the other objects, by name
+    :raises ValueError: if the file holds one of them only as a pickle
     """
     plain = description.get("plain")
     codes = plain if isinstance(plain, dict) else {}
@@ -114,8 +114,8 @@ def objects_for(path: object, description: Mapping[str, Any], given: Iterable[st
             continue
         if name not in codes:
             raise ValueError(
-                f"{path}: {name} is pickled, {str(value.get(':type:'))[:100]}, and to read it would be to run what the "
-                "file says. If you trust whom it is from, give trusted=True"
+                f"{path}: {name} is pickled, {str(value.get(':type:'))[:100]}, and unpickling executes code from the "
+                "file. If you trust its source, pass trusted=True"
             )
         objects[name] = decode(codes[name])
     return objects
@@ -124,17 +124,19 @@ def objects_for(path: object, description: Mapping[str, Any], given: Iterable[st
 def class_name(cls: type) -> str:
     """
     :param cls: a class
-    :return: what :func:`loaded_class` finds it by
+    :return: its name, with that of its module, see :func:`loaded_class`
     """
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
 def loaded_class(name: Any, root: type) -> type:
     """
-    :param name: name of a class, with that of its module
-    :param root: what it has to be derived from
-    :return: the class, which is never imported; the last if several have the name
-    :raises ValueError: if the program has no such class
+    Find a class that is already imported. Nothing is imported here.
+
+    :param name: name of the class, with that of its module
+    :param root: base class that it must be derived from
+    :return: the class; the last one if several have the name
+    :raises ValueError: if no such class is imported
     """
     waiting, found = [root], []
     while waiting:
@@ -143,7 +145,7 @@ def loaded_class(name: Any, root: type) -> type:
         if class_name(cls) == name:
             found.append(cls)
     if not found:
-        raise ValueError(f"there is no {root.__name__} {name}: if you have the module that it is in, import it first")
+        raise ValueError(f"there is no {root.__name__} {name}: import its module first")
     return found[0]
 
 
@@ -170,7 +172,7 @@ def _policy_class(name: str) -> type:
 
 
 def _float_schedule(value: Any) -> FloatSchedule:
-    # Given a schedule it takes it as it is.
+    # FloatSchedule accepts any callable.
     if not isinstance(value, ConstantSchedule | LinearSchedule | FloatSchedule | float | int):
         raise ValueError(f"{value!r} is no schedule")
     return FloatSchedule(value)
@@ -182,7 +184,7 @@ def _box(low: Any, high: Any, dtype: str) -> spaces.Box:
 
 def _discrete(n: int, start: int, dtype: str) -> spaces.Discrete[Any]:
     kind = np.dtype(dtype)
-    # Older versions of gymnasium have this type alone.
+    # Older versions of gymnasium support only this dtype.
     return spaces.Discrete(n, start=start) if kind == np.int64 else spaces.Discrete(n, start=start, dtype=kind)
 
 
@@ -190,7 +192,7 @@ def _multi_discrete(nvec: Any, start: Any, dtype: str) -> spaces.MultiDiscrete[A
     return spaces.MultiDiscrete(nvec, dtype=np.dtype(dtype), start=start)
 
 
-#: By name: the class, the arguments that make an equal object, and what makes it of them.
+#: By name: the class, a function from an object to the arguments of its constructor, and the constructor.
 _KINDS: dict[str, tuple[type, Callable[[Any], Iterable[Any]], Callable[..., Any]]] = {
     "tuple": (tuple, lambda items: items, lambda *items: items),
     "deque": (deque, lambda items: (list(items), items.maxlen), deque),

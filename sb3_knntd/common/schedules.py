@@ -1,4 +1,4 @@
-"""Schedules, and the words for them."""
+"""Schedules, and strings that describe them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_knntd.common.checks import check_schedule
 
-#: What words for schedules begin with.
+#: Prefix of strings that describe a linear schedule.
 LINEAR = "lin_"
 
 
 def parse_schedule(name: str, word: str) -> LinearSchedule:
     """
     :param name: name of the argument
-    :param word: ``"lin_START"``, which falls to 0 as in RL Zoo, or ``"lin_START_END"``
+    :param word: ``"lin_START"`` (falls to 0, as in RL Zoo) or ``"lin_START_END"``
     :return: the schedule, linear over the whole training
     :raises ValueError: if ``word`` is neither
     """
@@ -36,14 +36,14 @@ def check_rate(
     name: str, value: float | Schedule | str, low: float, high: float = math.inf, *, above: bool = False
 ) -> float | Schedule | str:
     """
-    Check what :func:`make_schedule` takes.
+    Check an argument of :func:`make_schedule`.
 
     :param name: name of the argument
-    :param value: number, schedule, or word for one
+    :param value: number, schedule, or string such as ``"lin_0.5"``
     :param low: lowest value allowed, or with ``above`` the value it must exceed
     :param high: highest value allowed
     :param above: whether ``low`` itself is excluded
-    :return: the number as a float, or the schedule or word
+    :return: the number as a float, or the schedule or string
     :raises ValueError: if it is none of these, or a value is out of range
     """
     if isinstance(value, str) and value.startswith(LINEAR):
@@ -54,7 +54,7 @@ def check_rate(
 
 def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
     """
-    :param num_timesteps: steps so far; with several environments they can exceed the total
+    :param num_timesteps: number of steps so far; with several environments it can exceed the total
     :param total_timesteps: total number of steps
     :return: the remaining fraction, from 1 to 0
     """
@@ -63,7 +63,7 @@ def progress_remaining(num_timesteps: int, total_timesteps: int) -> float:
 
 def make_schedule(value: float | Schedule | str) -> FloatSchedule:
     """
-    :param value: number, schedule, or word for one, checked
+    :param value: return value of :func:`check_rate`
     :return: the schedule
     """
     return FloatSchedule(parse_schedule("schedule", value) if isinstance(value, str) else value)

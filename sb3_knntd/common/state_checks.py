@@ -1,4 +1,4 @@
-"""Whether a state from a file can have been saved by what is to take it over: compiled code looks at no bounds."""
+"""Validation of state dicts that are loaded from files. Compiled code does not check array bounds."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def checked_tensor(
 ) -> th.Tensor:
     """
     :param state: a state dict
-    :param name: which of its tensors
-    :param shape: what its shape must be, ``None`` for any size
-    :param dtype: what its type must be, ``None`` for any floating type
-    :param low: its smallest value
-    :param high: its largest value
-    :param finite: whether all its values must be finite
+    :param name: name of the tensor
+    :param shape: required shape, ``None`` for any size
+    :param dtype: required type, ``None`` for any floating type
+    :param low: lowest value allowed
+    :param high: highest value allowed
+    :param finite: whether all values must be finite
     :return: the tensor
-    :raises ValueError: if there is none, or it is another; the message says in what
+    :raises ValueError: if it is missing or invalid
     """
     value = entry(state, name)
     if not isinstance(value, th.Tensor) or value.layout != th.strided or value.is_meta:
@@ -38,12 +38,12 @@ def checked_tensor(
         raise ValueError(f"{name} must have shape ({wanted}); got {sizes}")
     if value.dtype != dtype if dtype else not value.is_floating_point():
         raise ValueError(f"{name} must be of type {dtype or 'float'}; got {value.dtype}")
-    # A file can say that all of a tensor is one number, and have a small file fill the memory when it is copied.
+    # A tensor with strides of 0 stores few numbers whatever its shape: copying it could fill the memory.
     if value.untyped_storage().nbytes() < value.numel() * value.element_size():
-        raise ValueError(f"{name} has shape {sizes}, and fewer numbers than that")
+        raise ValueError(f"{name} has shape {sizes}, but stores fewer numbers")
     if value.numel():
         smallest, largest = (float(edge) for edge in value.aminmax())
-        # Not a number is neither below nor above.
+        # All comparisons with NaN are false.
         if not (low <= smallest and largest <= high) or (finite and not (np.isfinite([smallest, largest]).all())):
             raise ValueError(
                 f"{name} must be {'finite and ' if finite else ''}within [{low:g}, {high:g}]; got values "
@@ -55,28 +55,28 @@ def checked_tensor(
 def checked_points(state: Any, name: str, n_points: int) -> th.Tensor:
     """
     :param state: a state dict
-    :param name: which of its tensors
-    :param n_points: number of points there are
-    :return: the tensor, numbers of points
-    :raises ValueError: if it is none, or names a point twice, or one that does not exist
+    :param name: name of the tensor
+    :param n_points: number of points
+    :return: the tensor of point indices
+    :raises ValueError: if it is missing or invalid, or an index is out of range or occurs twice
     """
     points = checked_tensor(state, name, (None,), th.int64)
-    # Whole numbers: floats do not tell the largest apart.
+    # Compare as integers: floats cannot represent the largest indices exactly.
     if len(points) and (int(points.min()) < 0 or int(points.max()) >= n_points):
         raise ValueError(f"{name} must be within [0, {n_points - 1}]; got {int(points.min())} to {int(points.max())}")
     if len(points.unique()) < len(points):
-        raise ValueError(f"{name} must differ; some point is there twice")
+        raise ValueError(f"{name} must differ; a point occurs twice")
     return points
 
 
 def checked_integer(state: Any, name: str, low: int, high: int) -> int:
     """
     :param state: a state dict
-    :param name: which of its numbers
-    :param low: its smallest value
-    :param high: its largest value
-    :return: the number
-    :raises ValueError: if it is none, or another
+    :param name: name of the integer
+    :param low: lowest value allowed
+    :param high: highest value allowed
+    :return: the integer
+    :raises ValueError: if it is missing, no integer, or out of range
     """
     value = entry(state, name)
     if type(value) is not int or not low <= value <= high:
@@ -87,9 +87,9 @@ def checked_integer(state: Any, name: str, low: int, high: int) -> int:
 def entry(state: Any, name: str) -> Any:
     """
     :param state: a state dict
-    :param name: which of its entries
+    :param name: name of the entry
     :return: the entry
-    :raises ValueError: if there is none
+    :raises ValueError: if it is missing
     """
     if not isinstance(state, Mapping) or name not in state:
         raise ValueError(f"there is no {name} in the state {str(state)[:100]}")

@@ -1,4 +1,4 @@
-"""Whether torch records what is done: for ``torch.jit.trace``, ``torch.export``, ``torch.compile`` or ONNX."""
+"""Detect tracing by ``torch.jit.trace``, ``torch.export``, ``torch.compile`` or ONNX export."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ from torch.jit import is_tracing  # type: ignore[attr-defined]
 
 def is_traced() -> bool:
     """
-    :return: whether torch is recording operations: only those on tensors are in what comes of it
+    :return: whether torch is tracing. A trace contains only operations on tensors
     """
     return bool(is_tracing() or th.compiler.is_compiling())

@@ -1,4 +1,4 @@
-"""Checks of what environments return, before anything is learned from it."""
+"""Validation of the return values of environments, before learning from them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from sb3_knntd.common.checks import check_finite
 
-#: Types of numbers, as NumPy abbreviates them: truth values, integers and floats.
+#: Kinds of NumPy dtypes that numbers may have: booleans, integers and floats.
 NUMBERS = "biuf"
-#: Those that truth values may have.
+#: Kinds of NumPy dtypes that booleans may have.
 TRUTHS = "biu"
 
 
 class StepCheck:
     """
-    Checks the arrays that a step of a VecEnv returns. Compiled code does not look at their sizes.
+    Checks the arrays that a VecEnv returns. Compiled code does not check their shapes.
 
     :param n_envs: number of environments
     :param obs_shape: shape of one observation
@@ -31,7 +31,7 @@ class StepCheck:
 
     def reset(self, observations: Any) -> None:
         """
-        :param observations: what ``reset`` returned
+        :param observations: the return value of ``reset``
         :raises ValueError: if it is no array of the right shape
         """
         if getattr(observations, "shape", None) != self._observations_shape or observations.dtype.kind not in NUMBERS:
@@ -39,9 +39,9 @@ class StepCheck:
 
     def step(self, observations: Any, rewards: Any, dones: Any, infos: Any) -> None:
         """
-        The arguments are what ``step`` returned.
+        The arguments are the return values of ``step``.
 
-        :raises ValueError: if one of them is no array of the right shape, or there is not an info for each environment
+        :raises ValueError: if one of them is no array of the right shape, or the number of infos is wrong
         """
         try:
             fits = (
@@ -64,22 +64,22 @@ class StepCheck:
 
     def last_observation(self, env: int, observation: np.ndarray) -> None:
         """
-        :param env: which environment
+        :param env: index of the environment
         :param observation: its ``terminal_observation``
-        :raises ValueError: if it has another shape than observations have, or is not finite
+        :raises ValueError: if its shape or type is wrong, or it is not finite
         """
         if observation.shape != self._obs_shape or observation.dtype.kind not in NUMBERS:
             raise ValueError(
                 f"environment {env} returned a terminal observation of shape {observation.shape} and type "
                 f"{observation.dtype}; expected numbers of shape {self._obs_shape}"
             )
-        # Faster than NumPy with few numbers. NumPy then finds out where.
+        # For few numbers this is faster than NumPy, which then finds the position.
         if not all(map(isfinite, observation.ravel().tolist())):
             check_finite("a terminal observation", observation[None], [env])
 
     @staticmethod
     def _refuse(call: str, what: str, array: Any, shape: tuple[int, ...], kinds: str = NUMBERS) -> None:
-        """Raise an error that says how an array differs from what is expected, if it does."""
+        """Raise an error if an array is not as expected; the message says how it differs."""
         if not isinstance(array, np.ndarray):
             got = f"a {type(array).__name__}"
         elif array.shape != shape:
@@ -96,7 +96,7 @@ class StepCheck:
 
 
 def _first_odd_row(array: np.ndarray, shape: tuple[int, ...]) -> str:
-    """Which environment has no row, or is the first that has one too many."""
+    """The first environment without a row, or whose row is wrong, as text."""
     if array.ndim and array.shape[0] < shape[0]:
         return f", without one for environment {array.shape[0]}"
     if array.ndim and array.shape[1:] != shape[1:]:

@@ -1,3 +1,3 @@
-"""Many runs at once, and environments on other machines."""
+"""Run jobs in parallel, and environments on other machines."""
 
 from __future__ import annotations

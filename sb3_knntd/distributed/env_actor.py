@@ -1,4 +1,4 @@
-"""An environment in a process of a Ray cluster (extra ``[ray]``)."""
+"""An environment as an actor of a Ray cluster (extra ``[ray]``)."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def pack_request(name: str, /, *args: Any, **kwargs: Any) -> bytes:
 
 class EnvActor:
     """
-    An environment in a process of its own.
+    An environment in its own process.
 
-    Requests and answers are pickled here, not by Ray, which would return read-only arrays.
+    Requests and answers are pickled here, because Ray would return read-only arrays.
     """
 
     env: gym.Env[Any, Any]
@@ -40,26 +40,26 @@ class EnvActor:
     def answer(self, request: bytes) -> bytes:
         """
         :param request: made by :func:`pack_request`
-        :return: what the method returns, pickled
+        :return: the method's return value, pickled
         """
         name, args, kwargs = cloudpickle.loads(request)
         return bytes(cloudpickle.dumps(getattr(self, name)(*args, **kwargs)))
 
     def begin(self, env_fn: bytes, attributes: Mapping[str, bytes], log: str | None, restarts: int) -> str | None:
         """
-        Make the environment.
+        Create the environment.
 
-        :param env_fn: function that makes it, pickled
+        :param env_fn: function that creates it, pickled
         :param attributes: attributes to set afterwards, by name, pickled
-        :param log: Monitor's file of the environment that this one replaces
-        :param restarts: number of restarts so far, this one included
-        :return: Monitor's file of this one, ``None`` if it has no Monitor
+        :param log: Monitor file of the environment that this one replaces
+        :param restarts: number of restarts so far, including this one
+        :return: Monitor file of this environment, ``None`` if it has no Monitor
         """
         file = Path(log) if log else None
         before = file.read_bytes() if file and file.exists() else b""
         self.env = _patch_env(cloudpickle.loads(env_fn)())
         if file and before and not file.read_bytes().startswith(before):
-            # The new Monitor has overwritten the file. SB3's load_results also reads the one beside it.
+            # The new Monitor has overwritten the file. SB3's load_results also reads the renamed copy.
             stem = file.name.removesuffix(Monitor.EXT)
             replace_file(file.with_name(f"{stem}before_restart_{restarts}.{Monitor.EXT}"), before)
         for name, value in attributes.items():
@@ -70,14 +70,14 @@ class EnvActor:
 
     def spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
         """
-        :return: of the observations and of the actions
+        :return: observation space and action space
         """
         return self.env.observation_space, self.env.action_space
 
     def reset(self, seed: int | None, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """
         :param seed: ``None`` to keep the random generator as it is
-        :param options: the environment's own
+        :param options: options of the environment
         :return: the first observation and its info
         """
         observation, self.reset_info = self.env.reset(seed=seed, **({"options": options} if options else {}))
@@ -85,10 +85,10 @@ class EnvActor:
 
     def step(self, action: Any) -> tuple[Any, Any, bool, dict[str, Any], dict[str, Any]]:
         """
-        Make a step, and begin the next episode if this one is over.
+        Step the environment, and reset it if the episode has ended.
 
-        :param action: the environment's
-        :return: observation, reward, whether the episode is over, info, and info of the last reset
+        :param action: the action
+        :return: observation, reward, whether the episode has ended, info, and info of the last reset
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         info["TimeLimit.truncated"] = truncated and not terminated
@@ -100,13 +100,13 @@ class EnvActor:
 
     def render(self) -> Any:
         """
-        :return: what the environment's ``render`` returns
+        :return: the return value of the environment's ``render``
         """
         return self.env.render()
 
     def has_attr(self, name: str) -> bool:
         """
-        :param name: of an attribute
+        :param name: name of an attribute
         :return: whether the environment or a wrapper has it
         """
         try:
@@ -117,30 +117,30 @@ class EnvActor:
 
     def get_attr(self, name: str) -> Any:
         """
-        :param name: of an attribute of the environment or a wrapper
+        :param name: name of an attribute of the environment or a wrapper
         :return: its value
         """
         return self.env.get_wrapper_attr(name)
 
     def set_attr(self, name: str, value: Any) -> None:
         """
-        :param name: of an attribute of the outermost wrapper
+        :param name: name of an attribute of the outermost wrapper
         :param value: its new value
         """
         setattr(self.env, name, value)
 
     def env_method(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """
-        :param name: of a method of the environment or a wrapper
+        :param name: name of a method of the environment or a wrapper
         :param args: its arguments
         :param kwargs: its keyword arguments
-        :return: what it returns
+        :return: its return value
         """
         return self.env.get_wrapper_attr(name)(*args, **kwargs)
 
     def is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]]) -> bool:
         """
-        :param wrapper_class: of a wrapper
+        :param wrapper_class: class of a wrapper
         :return: whether the environment has such a wrapper
         """
         return is_wrapped(self.env, wrapper_class)

@@ -1,6 +1,6 @@
 """
-Many independent jobs, each with its result in a file, so that what was interrupted goes on where it was. Here they are
-computed on the cores of this machine; :mod:`sb3_knntd.distributed.ray_jobs` has other machines compute them.
+Run many independent jobs and store the result of each in a file, so that an interrupted run can be resumed. This module
+runs them on the cores of this machine; :mod:`sb3_knntd.distributed.ray_jobs` runs them on a Ray cluster.
 """
 
 from __future__ import annotations
@@ -27,17 +27,19 @@ from filelock import FileLock, Timeout
 
 from sb3_knntd.common.files import replace_file
 
-#: What keeps a worker's libraries to one thread: with a worker a core, more would only wait for each other.
+#: Environment variables that limit a worker's libraries to one thread. With one worker per core, more threads would
+#: only compete.
 ONE_THREAD = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR", "NUMBA")
 }
-#: What is locked in a folder where jobs are computed.
+#: Name of the lock file in a folder of results.
 LOCK = ".lock"
-#: Attribute of a function: the names that :func:`stored_as` was given.
+#: Attribute of a decorated function: the names passed to :func:`stored_as`.
 _NAMES = "_stored_as"
-#: How often a job is begun whose worker process dies.
+#: Number of times a job is started if its worker process dies.
 ATTEMPTS = 2
-#: Where there is no terminal, progress is told in so many lines, and when so many seconds have passed since the last.
+#: Without a terminal, progress is printed in about this many lines, and also whenever this many seconds have passed
+#: since the last line.
 PROGRESS_LINES = 10
 PROGRESS_SECONDS = 60.0
 
@@ -47,12 +49,12 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def stored_as(name: str, *earlier: str) -> Callable[[Function], Function]:
     """
-    Decorate a function that computes jobs. Files of results name the function, and a result counts as computed only
-    under this name; so it stays the same when the function moves to another module, and changes when the function
-    computes something else.
+    Decorate a function that computes jobs. Result files store this name, and a result is reused only if its name
+    matches. Keep the name when the function moves to another module; change it when the function computes something
+    else.
 
-    :param name: what its results are stored under
-    :param earlier: what they were stored under before; such results still count
+    :param name: name that its results are stored under
+    :param earlier: former names; results stored under them are still reused
     :return: the decorator, which returns the function itself
     """
 
@@ -65,13 +67,13 @@ def stored_as(name: str, *earlier: str) -> Callable[[Function], Function]:
 
 class Job(NamedTuple):
     """
-    Something to compute.
+    A function call to run.
 
-    :param key: its name, and that of its file: letters, digits, ``_`` and ``-``
-    :param function: what computes it, a function that can be imported by its name, decorated with :func:`stored_as`
-    :param arguments: keyword arguments, of what JSON can hold
-    :param fits: whether something that is read from a file can be its result, a function that can be imported by its
-        name; by default anything can
+    :param key: unique name, also the stem of the result file: letters, digits, ``_`` and ``-``
+    :param function: the function to call, picklable (importable by name), decorated with :func:`stored_as`
+    :param arguments: keyword arguments, JSON-serializable
+    :param fits: predicate that tells whether a value read from a file is a valid result, picklable; by default every
+        value is
     """
 
     key: str
@@ -82,9 +84,9 @@ class Job(NamedTuple):
 
 class Outcome(NamedTuple):
     """
-    What became of a job.
+    The outcome of a job.
 
-    :param result: what its function returned, as JSON gives it back
+    :param result: the function's return value, after a round trip through JSON
     :param error: why there is no result, a traceback or a sentence; empty if there is one
     """
 
@@ -92,7 +94,7 @@ class Outcome(NamedTuple):
     error: str = ""
 
 
-#: What computes jobs: it tells of each when it begins, with ``None``, and when it has come to its end.
+#: A job that has started (with ``None``) or finished (with its outcome). A backend runs jobs and yields these events.
 Event = tuple[Job, Outcome | None]
 Backend = Callable[[Sequence[Job]], Generator[Event, None, None]]
 
@@ -101,21 +103,21 @@ def run_jobs(
     jobs: Sequence[Job], folder: Path, workers: int | None = None, title: str = "", backend: Backend | None = None
 ) -> dict[str, Outcome]:
     """
-    Compute what is not yet in the folder, several jobs at a time, with a progress bar on standard error.
+    Run the jobs whose results are not yet in the folder, several at a time, with a progress bar on standard error.
 
-    The outcome of each job is stored as ``key.json`` as soon as there is one. A result that was computed by the same
-    function (:func:`stored_as`) from the same arguments is read from its file; everything else is computed, also what
-    failed before. Whatever ends the program, all files are complete, and the next call continues from them.
+    The outcome of each job is stored as ``key.json`` as soon as it finishes. A result of the same function
+    (:func:`stored_as`) with the same arguments is read from its file; all other jobs are run, including those that
+    failed before. However the program ends, all files are complete and the next call continues from them.
 
-    :param jobs: what to compute, keys all different
-    :param folder: where outcomes are; made if it is not there
+    :param jobs: the jobs, with distinct keys
+    :param folder: folder of the outcomes, created if missing
     :param workers: number of processes; by default one for each core that this process may use
-    :param title: what the progress is of
-    :param backend: what computes them; by default so many processes of this machine
+    :param title: label of the progress bar
+    :param backend: runs the jobs; by default ``workers`` processes of this machine
     :return: the outcome of each job, by key, in the order of ``jobs``
-    :raises ValueError: if a key is no file name or there twice, a function has no :func:`stored_as`, or ``workers`` < 1
-    :raises TypeError: if JSON cannot hold the arguments of a job
-    :raises OSError: if the folder cannot be written to, or another process computes there
+    :raises ValueError: if a key is invalid or occurs twice, a function lacks :func:`stored_as`, or ``workers`` < 1
+    :raises TypeError: if the arguments of a job are not JSON-serializable
+    :raises OSError: if the folder is not writable, or another process runs jobs there
     """
     if workers is not None and workers < 1:
         raise ValueError(f"workers must be at least 1; got {workers}")
@@ -129,7 +131,7 @@ def run_jobs(
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Nothing is computed twice; a lock of a process that is killed is gone."""
+    """Lock the folder, so that no job runs twice. The lock of a killed process is released."""
     try:
         with FileLock(folder / LOCK, blocking=False):
             yield
@@ -174,18 +176,18 @@ def run_locally(
     jobs: Sequence[Job], workers: int, fresh: bool = False, preload: Sequence[str] = ()
 ) -> Generator[Event, None, None]:
     """
-    Compute jobs in processes of this machine. If the iterator is closed, or this process dies, so do they.
+    Run jobs in processes of this machine. The processes end when the iterator is closed or this process dies.
 
-    :param jobs: what to compute
+    :param jobs: the jobs
     :param workers: number of processes
-    :param fresh: whether each job gets a process of its own, as it must where memory is measured
-    :param preload: modules that fresh processes find imported, where the system can do that
-    :return: each job when it begins, and with its outcome in the order in which they come to their end
+    :param fresh: whether to run each job in a new process, e.g. to measure its memory
+    :param preload: modules that new processes have already imported, where the platform supports it
+    :return: each job when it starts, and again with its outcome, in order of completion
     """
     context = _context(preload if fresh else ())
-    # Nothing is ever sent. Workers end when it closes, which it does even if this process is killed.
+    # Nothing is sent through this pipe. Workers exit when it closes, which happens even if this process is killed.
     lifeline, holder = context.Pipe(duplex=False)
-    # One process each: if it dies, that tells which job it died of.
+    # One process per pool, so that the death of a process identifies the job it was running.
     idle = [_new_worker(context, lifeline) for _ in range(min(workers, len(jobs)))]
     waiting = deque((job, 1) for job in jobs)
     running: dict[Future[Outcome], tuple[Job, int, ProcessPoolExecutor]] = {}
@@ -193,9 +195,9 @@ def run_locally(
         while waiting or running:
             while waiting and idle:
                 (job, attempt), worker = waiting.popleft(), idle.pop()
-                with _environment(ONE_THREAD), _interrupts_held():  # a worker starts with its first job
+                with _environment(ONE_THREAD), _interrupts_held():  # the first job starts the process
                     running[worker.submit(compute, job)] = job, attempt, worker
-                # The worker alone has the other end now: if it dies in the middle of an answer, that is its end.
+                # Now only the worker holds the write end: if it dies while sending a result, the read end gets EOF.
                 worker._result_queue._writer.close()  # type: ignore[attr-defined]
                 yield job, None
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -222,7 +224,7 @@ def run_locally(
 
 
 def _context(preload: Sequence[str]) -> SpawnContext | ForkServerContext:
-    """How processes are started: anew, or from one that has imported what they need."""
+    """The start method: spawn, or forkserver with preloaded modules."""
     if not preload or "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
@@ -240,7 +242,7 @@ def usable_cores() -> int:
 
 
 def _description(job: Job) -> dict[str, Any]:
-    """What its outcome depends on, as JSON gives it back."""
+    """The function and arguments of a job, after a round trip through JSON."""
     if not job.key or not all(character.isalnum() or character in "_-" for character in job.key):
         raise ValueError(f"a key must be letters, digits, '_' and '-'; got {job.key!r}")
     name = _names(job.function)[0]
@@ -249,7 +251,7 @@ def _description(job: Job) -> dict[str, Any]:
 
 
 def _names(function: Callable[..., Any]) -> tuple[str, ...]:
-    """What results of a function are stored under, and were before."""
+    """The name that results of a function are stored under, and its former names."""
     names: tuple[str, ...] = getattr(function, _NAMES, ())
     if not names:
         raise ValueError(f"{function.__qualname__} must be decorated with stored_as(name) to compute jobs")
@@ -257,7 +259,7 @@ def _names(function: Callable[..., Any]) -> tuple[str, ...]:
 
 
 def _stored_outcome(path: Path, description: dict[str, Any], job: Job) -> Outcome | None:
-    """The result in a file, if it is there and of just this job."""
+    """The result in a file, if it exists and belongs to this job."""
     try:
         stored = json.loads(path.read_bytes())
     except FileNotFoundError:
@@ -273,7 +275,7 @@ def _stored_outcome(path: Path, description: dict[str, Any], job: Job) -> Outcom
             return None
         if job.fits is None or job.fits(result):
             return Outcome(result)
-    print(f"{path} is damaged, and its job is computed anew", file=sys.stderr)
+    print(f"{path} is damaged; its job is run again", file=sys.stderr)
     return None
 
 
@@ -282,7 +284,7 @@ def _new_worker(context: SpawnContext | ForkServerContext, lifeline: Connection)
 
 
 def _start_worker(lifeline: Connection) -> None:
-    # Ctrl-C goes to all processes of a terminal. What is to become of the workers the first one decides.
+    # Ctrl-C is sent to all processes of the terminal. The main process decides when the workers exit.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
 
@@ -294,8 +296,10 @@ def _end_with(lifeline: Connection) -> None:
 
 def compute(job: Job) -> Outcome:
     """
-    :param job: what to compute, here and now
-    :return: its outcome; what its function raises is the reason why there is no result
+    Run a job in this process.
+
+    :param job: the job
+    :return: its outcome; if the function raises, the traceback is its ``error``
     """
     try:
         return Outcome(json.loads(json.dumps(job.function(**job.arguments))))
@@ -319,17 +323,17 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Ctrl-C comes afterwards; to a process that is started meanwhile never, not even before it can ask not to."""
+    """Delay Ctrl-C until the block ends. A process started in it never receives Ctrl-C, not even while it starts."""
     held = False
 
     def hold(*_: object) -> None:
         nonlocal held
         held = True
 
-    # Blocking is for the process that is started, which inherits it. Here the signal finds a thread that does not.
+    # The new process inherits the blocked signal. In this process, another thread may still receive it.
     blocks = hasattr(signal, "pthread_sigmask")
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if blocks else set()
-    # What was set outside of Python could not be set again, and other threads are not interrupted.
+    # A handler installed outside Python (None) could not be restored, and only the main thread is interrupted.
     handler = signal.getsignal(signal.SIGINT)
     holds = handler is not None and threading.current_thread() is threading.main_thread()
     if holds:
@@ -348,13 +352,13 @@ def _interrupts_held() -> Iterator[None]:
 @contextmanager
 def _progress(title: str, total: int, done: int) -> Iterator[Callable[[Outcome | None, int], None]]:
     """
-    A progress bar on a terminal, else some lines.
+    A progress bar on a terminal, otherwise a few lines of text.
 
-    :param title: what is in progress
+    :param title: label of the progress bar
     :param total: number of jobs
-    :param done: number of those that were there already
-    :return: what to call for each job when it begins, with ``None``, and when it has come to its end, with its outcome;
-        and both times with how many are running now
+    :param done: number of jobs already done
+    :return: a function to call when a job starts, with ``None``, and when it finishes, with its outcome; its second
+        argument is the number of running jobs
     """
     from tqdm import tqdm
 

@@ -1,4 +1,4 @@
-"""Jobs on the machines of a Ray cluster (extra ``[ray]``)."""
+"""Run jobs on a Ray cluster (extra ``[ray]``)."""
 
 from __future__ import annotations
 
@@ -15,37 +15,39 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from sb3_knntd.distributed.jobs import ONE_THREAD, Event, Job, Outcome, compute
 
-#: How often a job is begun again whose process or machine dies.
+#: Number of times a job is restarted if its process or machine dies.
 RETRIES = 3
-#: Seconds between two looks at which jobs have begun.
+#: Interval between two polls for started jobs, seconds.
 LOOK_SECONDS = 1.0
 GIB = 2**30
 
 
 class Board:
-    """Where jobs say that they have begun; only for display."""
+    """Actor that collects which jobs have started, for the progress bar."""
 
     def __init__(self) -> None:
         self._begun: list[str] = []
 
     def begin(self, key: str) -> None:
         """
-        :param key: of a job
+        :param key: key of a job that has started
         """
         self._begun.append(key)
 
     def begun(self, first: int) -> list[str]:
         """
-        :param first: how many are known already
-        :return: keys of the jobs that have begun since
+        :param first: number of keys to skip: those already read
+        :return: keys of the jobs that have started since
         """
         return self._begun[first:]
 
 
 def compute_on_ray(job: Job, board: Any) -> Outcome:
     """
-    :param job: what to compute, on whichever machine this runs
-    :param board: handle of the :class:`Board` where to say that it has begun
+    Run a job as a Ray task.
+
+    :param job: the job
+    :param board: handle of the :class:`Board` to notify of its start
     :return: its outcome
     """
     board.begin.remote(job.key)
@@ -54,17 +56,17 @@ def compute_on_ray(job: Job, board: Any) -> Outcome:
 
 def connect(address: str | None = None, log_to_driver: bool = False) -> bool:
     """
-    Connect this process to a cluster; whoever is connected already stays so.
+    Connect this process to a Ray cluster, unless it is already connected.
 
-    :param address: ``"auto"`` for the cluster that this machine belongs to, ``"ray://host:port"`` for one elsewhere,
-        ``None`` for that of ``RAY_ADDRESS``, or else one of this machine alone
-    :param log_to_driver: whether what is printed elsewhere is shown here
-    :return: whether it was not connected before
+    :param address: ``"auto"`` for the cluster of this machine, ``"ray://host:port"`` for a remote cluster, ``None`` for
+        the one of the environment variable ``RAY_ADDRESS`` or, if unset, a new local cluster
+    :param log_to_driver: whether to print the workers' output in this process
+    :return: whether a new connection was made
     :raises ConnectionError: if there is no such cluster
     """
     if ray.is_initialized():
         return False
-    # Given nothing, Ray itself would take whichever cluster was started last on this machine.
+    # Without an address, Ray would connect to the cluster last started on this machine.
     address = address or os.environ.get("RAY_ADDRESS") or "local"
     ray.init(
         address,
@@ -78,9 +80,9 @@ def connect(address: str | None = None, log_to_driver: bool = False) -> bool:
 @contextmanager
 def connected(address: str | None = None) -> Iterator[None]:
     """
-    Be connected to a cluster for as long as this lasts; whoever is connected already stays so.
+    Context manager: :func:`connect`, and disconnect at the end if a new connection was made.
 
-    :param address: as :func:`connect` takes it
+    :param address: see :func:`connect`
     :raises ConnectionError: if there is no such cluster
     """
     is_ours = connect(address)
@@ -95,22 +97,22 @@ def run_on_ray(
     jobs: Sequence[Job], cpus: float = 1.0, memory: float | None = None, retries: int = RETRIES
 ) -> Generator[Event, None, None]:
     """
-    Compute jobs as tasks of the cluster that this process is connected to, each in a process of its own. The package,
-    and what the jobs need besides, must be installed on its machines, in the same versions.
+    Run jobs as tasks of the connected cluster, each in its own process. This package and the jobs' dependencies must be
+    installed on its machines, in the same versions.
 
-    Results come back to this process, so that machines need share no disk. A job whose process or machine dies is begun
-    again elsewhere; one that raises is not. If the iterator is closed, what is running is stopped.
+    Results are returned to this process, so the machines need no shared disk. A job whose process or machine dies is
+    restarted elsewhere; a job that raises is not. Closing the iterator stops the running jobs.
 
-    :param jobs: what to compute
+    :param jobs: the jobs
     :param cpus: CPUs that Ray reserves for each job
-    :param memory: GiB that it reserves for each, ``None`` for none
-    :param retries: how often a job is begun again whose process or machine dies
-    :return: each job when it begins, and with its outcome in the order in which they come to their end
+    :param memory: memory that Ray reserves for each job, GiB; ``None`` to reserve none
+    :param retries: number of times a job is restarted if its process or machine dies
+    :return: each job when it starts, and again with its outcome, in order of completion
     """
-    # Where this process runs no node dies without it.
+    # Keep the board on this process's node: if that node dies, so does this process.
     here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
     board: ActorHandle[Any] = ray.remote(Board).options(num_cpus=0, scheduling_strategy=here).remote()  # type: ignore[assignment]
-    # A process serves one job, and its libraries have one thread.
+    # One process per job, and one thread for its libraries.
     task = ray.remote(max_calls=1)(compute_on_ray).options(
         num_cpus=cpus,
         memory=None if memory is None else int(memory * GIB),
@@ -140,7 +142,7 @@ def run_on_ray(
 def _begun(board: ActorHandle[Any], n_known: int) -> list[str]:
     try:
         return list(ray.get(board.begun.remote(n_known), timeout=LOOK_SECONDS))
-    except (GetTimeoutError, RayActorError):  # without it only the display knows less
+    except (GetTimeoutError, RayActorError):  # only the progress bar depends on it
         return []
 
 

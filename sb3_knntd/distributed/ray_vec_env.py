@@ -34,9 +34,9 @@ except ImportError as error:
 from sb3_knntd.distributed.env_actor import EnvActor, pack_request
 from sb3_knntd.distributed.ray_jobs import connect
 
-#: Seconds without room in the cluster before a warning says what is missing.
+#: Seconds to wait for resources of the cluster before warning about what is missing.
 PATIENCE = 30.0
-#: Raised by Ray if a process or its machine has died, or its answer was lost with it.
+#: Raised by Ray if a process or its machine has died, or its answer was lost.
 DEATHS = (
     RayActorError,
     NodeDiedError,
@@ -45,50 +45,51 @@ DEATHS = (
     OutOfMemoryError,
     ObjectLostError,
 )
-#: Options of Ray's actors that are fixed here or are parameters of :class:`RayVecEnv`.
+#: Options of a Ray actor that are fixed here or are parameters of :class:`RayVecEnv`.
 SETTLED = {"num_cpus", "max_restarts", "max_task_retries", "max_concurrency", "name", "lifetime", "get_if_exists"}
 
 
 class RayVecEnv(VecEnv):
     """
-    SB3's SubprocVecEnv over a Ray cluster: each environment is in a process of its own, on any of its machines. It is
-    for simulators that take milliseconds a step or more. With the same seeds it returns what SubprocVecEnv returns.
+    SB3's SubprocVecEnv on a Ray cluster: each environment runs in its own process, on any machine of the cluster. It is
+    for simulators that take milliseconds per step or more. With the same seeds it returns what SubprocVecEnv returns.
 
-    It uses the Ray that this process is connected to, and connects it if it is not; the connection then stays until the
-    program ends or calls ``ray.shutdown()``. What the environments need must be installed on all machines.
+    It uses the cluster that this process is connected to, or connects to one; the connection then stays open until the
+    program ends or calls ``ray.shutdown()``. The environments' dependencies must be installed on all machines.
 
     .. code-block:: python
 
         kwargs = {"address": "auto", "num_cpus": 2}
         venv = make_vec_env("Ant-v5", 32, vec_env_cls=RayVecEnv, vec_env_kwargs=kwargs)
 
-    An environment whose process or machine dies is made anew, wherever there is room. Its episode ends with that step,
-    truncated: the reward is 0, ``terminal_observation`` in its info is the last observation that was seen,
-    ``TimeLimit.truncated`` and ``env_restarted`` are true, and of a Monitor within there is no ``episode``. The new
+    An environment whose process or machine dies is restarted wherever resources are free. The current step truncates
+    its episode: the reward is 0, ``terminal_observation`` in its info is the last observation received,
+    ``TimeLimit.truncated`` and ``env_restarted`` are true, and the info of a Monitor has no ``episode``. The new
     environment
 
-    - has the attributes that :meth:`set_attr` has set; what its methods have changed is lost;
-    - is reset with a seed drawn from its last one and the number of restarts, without a seed if it had none;
-    - keeps the rows of a Monitor's file that it finds on its machine, under a name beside it.
+    - has the attributes set by :meth:`set_attr`; changes made by its methods are lost;
+    - is reset with a seed derived from its last seed and the number of restarts, or without a seed if it had none;
+    - keeps the rows of a Monitor file that it finds on its machine in a second file beside it.
 
-    If it dies in :meth:`reset` or while it is asked something, the same is asked of the new one. What an environment
-    raises is raised here, with its traceback, and is no death.
+    If an environment dies during :meth:`reset` or another call, the call is repeated in the new environment. An
+    exception raised by an environment is raised here, with its traceback, and does not restart it.
 
-    :param env_fns: make the environments, each its own
-    :param num_cpus: CPUs that Ray reserves for each environment, any number >= 0; with less than 1 they share
+    :param env_fns: functions that create the environments, one for each
+    :param num_cpus: CPUs that Ray reserves for each environment, any number >= 0; below 1, environments share a CPU
     :param actor_options: other options of a Ray actor, such as ``num_gpus``, ``memory`` (bytes), ``resources``,
-        ``runtime_env`` and ``scheduling_strategy``, by default ``"SPREAD"``, over the machines
-    :param address: ``"auto"`` for the cluster that this machine belongs to, ``"ray://host:port"`` for one elsewhere,
-        ``None`` for that of ``RAY_ADDRESS``, or else one of this machine alone; of no effect if already connected
-    :param max_restarts: how often in a row an environment is made anew without coming to the end of an episode, an
+        ``runtime_env`` and ``scheduling_strategy`` (by default ``"SPREAD"``: spread over the machines)
+    :param address: ``"auto"`` for the cluster of this machine, ``"ray://host:port"`` for a remote cluster, ``None`` for
+        the one of the environment variable ``RAY_ADDRESS`` or, if unset, a new local cluster; ignored if already
+        connected
+    :param max_restarts: maximum number of consecutive restarts of an environment without a finished episode, an
         integer >= 0
-    :param timeout: seconds that an environment has for an answer, above 0; one that takes longer counts as dead.
-        ``None`` waits for ever
-    :param placement_timeout: seconds to wait for room in the cluster, above 0
+    :param timeout: seconds to wait for an answer of an environment, above 0; a slower one is considered dead. ``None``
+        to wait forever
+    :param placement_timeout: seconds to wait for resources of the cluster, above 0
     :raises ImportError: on import of the module, if Ray is not installed
-    :raises ValueError: if an argument does not fit; the message says which, and what would
+    :raises ValueError: if an argument is invalid; the message names it and says what is valid
     :raises ConnectionError: if there is no cluster at ``address``
-    :raises TimeoutError: if the cluster has no room for the environments
+    :raises TimeoutError: if the cluster has too few resources for the environments
     :raises RuntimeError: if an environment dies more often than ``max_restarts``, here or later
     """
 
@@ -113,7 +114,7 @@ class RayVecEnv(VecEnv):
         if SETTLED & options.keys():
             raise ValueError(
                 f"actor_options cannot have {', '.join(sorted(SETTLED & options.keys()))}: num_cpus and max_restarts "
-                "are parameters of RayVecEnv, and the rest it settles itself"
+                "are parameters of RayVecEnv, and it sets the others itself"
             )
         self.max_restarts = check_integer("max_restarts", max_restarts, 0)
         self.timeout = None if timeout is None else check_number("timeout", timeout, 0.0, above=True)
@@ -122,7 +123,7 @@ class RayVecEnv(VecEnv):
             "scheduling_strategy": "SPREAD",
             **options,
             "num_cpus": check_number("num_cpus", num_cpus, 0.0),
-            # Ray's own restarts would put an environment that was never reset in the place of one in an episode.
+            # A restart by Ray would replace an environment within an episode by one that has not been reset.
             "max_restarts": 0,
             "max_task_retries": 0,
         }
@@ -133,7 +134,7 @@ class RayVecEnv(VecEnv):
         asked_for = {"num_cpus": num_cpus, **(actor_options or {})}
         self._asked_for = {key: value for key, value in asked_for.items() if key != "runtime_env"}
 
-        #: how often each environment was made anew, shape (n_envs,)
+        #: number of restarts of each environment, shape (n_envs,)
         self.restarts = [0] * n_envs
         self.waiting = False
         self.closed = False
@@ -142,9 +143,9 @@ class RayVecEnv(VecEnv):
         self._attributes: list[dict[str, bytes]] = [{} for _ in env_fns]
         self._logs: list[str | None] = [None] * n_envs
         self._last_seeds: list[int | None] = [None] * n_envs
-        # The last observation of each environment within an episode.
+        # Last observation of each environment that is within an episode.
         self._observations: dict[int, Any] = {}
-        # First observation and info of environments that were restarted within an episode, until the next step.
+        # First observation and info of the environments restarted within an episode, until the next step.
         self._begun_anew: dict[int, tuple[Any, dict[str, Any]]] = {}
         self._steps: list[tuple[int, ray.ObjectRef[bytes]]] = []
         self._actors: dict[int, ActorHandle[Any]] = {}
@@ -171,7 +172,7 @@ class RayVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """
-        :return: observations, rewards of shape (n_envs,), whether episodes are over, of the same shape, and infos
+        :return: observations, rewards, shape (n_envs,), whether the episodes have ended, shape (n_envs,), and infos
         """
         steps = [(index, step) for index, step in self._steps if index not in self._begun_anew]
         try:
@@ -211,7 +212,7 @@ class RayVecEnv(VecEnv):
         return _stack_obs(observations, self.observation_space)
 
     def close(self) -> None:
-        """Close the environments and end their processes."""
+        """Close the environments and stop their processes."""
         if self.closed:
             return
         self.closed = True
@@ -235,25 +236,25 @@ class RayVecEnv(VecEnv):
 
     def has_attr(self, attr_name: str) -> bool:
         """
-        :param attr_name: of an attribute of the environments or their wrappers
-        :return: whether all have it
+        :param attr_name: name of an attribute of the environments or their wrappers
+        :return: whether all environments have it
         """
         return all(self._call(range(self.num_envs), "has_attr", attr_name))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """
-        :param attr_name: of an attribute of the environments or their wrappers
-        :param indices: of the environments asked, ``None`` for all
-        :return: its value in each of them, a copy
+        :param attr_name: name of an attribute of the environments or their wrappers
+        :param indices: indices of environments, ``None`` for all
+        :return: a copy of its value in each of them
         :raises AttributeError: if one has no such attribute
         """
         return self._call(self._targets(indices), "get_attr", attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """
-        :param attr_name: of an attribute of the outermost wrappers
-        :param value: its new value, of which each has a copy, also environments that are made anew
-        :param indices: of the environments, ``None`` for all
+        :param attr_name: name of an attribute of the outermost wrappers
+        :param value: its new value; each environment gets a copy, also after a restart
+        :param indices: indices of environments, ``None`` for all
         """
         targets = self._targets(indices)
         self._call(targets, "set_attr", attr_name, value)
@@ -265,11 +266,11 @@ class RayVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """
-        :param method_name: of a method of the environments or their wrappers
+        :param method_name: name of a method of the environments or their wrappers
         :param method_args: its arguments
-        :param indices: of the environments, ``None`` for all
+        :param indices: indices of environments, ``None`` for all
         :param method_kwargs: its keyword arguments
-        :return: what each returns
+        :return: the return value of each
         :raises AttributeError: if one has no such method
         """
         return self._call(self._targets(indices), "env_method", method_name, *method_args, **method_kwargs)
@@ -278,23 +279,23 @@ class RayVecEnv(VecEnv):
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
         """
-        :param wrapper_class: of a wrapper
-        :param indices: of the environments asked, ``None`` for all
-        :return: whether each has such a wrapper around it
+        :param wrapper_class: class of a wrapper
+        :param indices: indices of environments, ``None`` for all
+        :return: whether each is wrapped in it
         """
         return self._call(self._targets(indices), "is_wrapped", wrapper_class)
 
     # ----------------------------------------------------- requests and answers
 
     def _targets(self, indices: VecEnvIndices) -> list[int]:
-        # Negative ones count from the end.
+        # Negative indices count from the end.
         return [range(self.num_envs)[index] for index in self._get_indices(indices)]
 
     def _call(self, targets: Sequence[int], name: str, /, *args: Any, **kwargs: Any) -> list[Any]:
         return self._call_each(targets, [pack_request(name, *args, **kwargs)] * len(targets))
 
     def _call_each(self, targets: Sequence[int], requests: Sequence[bytes]) -> list[Any]:
-        """Send a request to each target and wait for all answers; send it again to environments that died over it."""
+        """Send a request to each target and wait for all answers. If an environment dies, send its request again."""
         answers: list[Any] = [None] * len(targets)
         left = list(range(len(targets)))
         while left:
@@ -309,9 +310,9 @@ class RayVecEnv(VecEnv):
         return self._actors[index].answer.remote(request)
 
     def _receive(self, asked: Sequence[tuple[int, ray.ObjectRef[bytes]]]) -> tuple[list[Any], dict[int, Exception]]:
-        """The answers, ``None`` where there is none, and the reason for that by environment."""
+        """The answers, ``None`` for an environment that died, and the error of each of these by environment."""
         references = [reference for _, reference in asked]
-        # Wait for all, so that none is still busy when one of them raises.
+        # Wait for all first, so that no environment is busy when another one raises.
         late = set(ray.wait(references, num_returns=len(references), timeout=self.timeout)[1]) if references else set()
         answers: list[Any] = []
         deaths: dict[int, Exception] = {}
@@ -322,7 +323,7 @@ class RayVecEnv(VecEnv):
             else:
                 try:
                     answer = cloudpickle.loads(ray.get(reference))
-                except RayTaskError:  # raised by the environment, whatever it is besides
+                except RayTaskError:  # raised by the environment, even if its type is also one of DEATHS
                     raise
                 except DEATHS as error:
                     deaths[index] = error
@@ -339,22 +340,22 @@ class RayVecEnv(VecEnv):
             deaths = self._start(list(deaths))
 
     def _tell_of_death(self, index: int, error: Exception) -> None:
-        # Ray's messages end with what happened.
+        # The last line of Ray's messages says what happened.
         reason = textwrap.shorten((str(error).strip() or type(error).__name__).splitlines()[-1], 300)
         if self._deaths_in_row[index] >= self.max_restarts:
             raise RuntimeError(
-                f"environment {index} has died {self._deaths_in_row[index] + 1} times in a row without an episode that "
-                f"came to its end, and max_restarts is {self.max_restarts}. Its last death: {reason}. If it always "
-                "dies, run it in this process to see why: DummyVecEnv in place of RayVecEnv"
+                f"environment {index} has died {self._deaths_in_row[index] + 1} times in a row without finishing an "
+                f"episode, and max_restarts is {self.max_restarts}. Its last death: {reason}. If it always dies, run "
+                "it in this process to see why: use DummyVecEnv instead of RayVecEnv"
             ) from error
         self._deaths_in_row[index] += 1
         self.restarts[index] += 1
         warnings.warn(
-            f"environment {index} died and is made anew (restart {self.restarts[index]}): {reason}", stacklevel=2
+            f"environment {index} died and is restarted (restart {self.restarts[index]}): {reason}", stacklevel=2
         )
 
     def _start(self, indices: Sequence[int]) -> dict[int, Exception]:
-        """Make environments, and reset those that were in an episode; the reasons of deaths, by environment."""
+        """Create environments, and reset those that were within an episode; the error of each that died, by index."""
         deaths = self._place(indices)
         living = [index for index in indices if index not in deaths]
         logs, died = self._receive([(index, self._send(index, self._beginning(index))) for index in living])
@@ -375,10 +376,10 @@ class RayVecEnv(VecEnv):
         return deaths
 
     def _place(self, indices: Iterable[int]) -> dict[int, Exception]:
-        """Start a process for each environment; the reasons of those that died at once, by environment."""
+        """Start a process for each environment; the error of each that died, by index."""
         for index in indices:
             if index in self._actors:
-                # The old process may still be alive, unreachable or busy for too long.
+                # The old process may be alive, but unreachable or busy for too long.
                 ray.kill(self._actors[index])
             self._actors[index] = self._actor_class.remote()  # type: ignore[assignment]
         ready: dict[ray.ObjectRef[Any], int] = {self._actors[index].__ray_ready__.remote(): index for index in indices}
@@ -406,9 +407,9 @@ class RayVecEnv(VecEnv):
             for amounts in (ray.cluster_resources(), ray.available_resources())
         )
         return (
-            f"the processes of {n_without} of {len(self.restarts)} environments. Each asks for {self._asked_for}; the "
-            f"cluster has {there}, of which {free} is free. If that is too little, fewer environments or a smaller "
-            "num_cpus would fit"
+            f"the processes of {n_without} of {len(self.restarts)} environments. Each needs {self._asked_for}; the "
+            f"cluster has {there}, of which {free} is free. If that is too little, use fewer environments or a smaller "
+            "num_cpus"
         )
 
     def _beginning(self, index: int) -> bytes:
@@ -420,11 +421,11 @@ class RayVecEnv(VecEnv):
         seed = self._last_seeds[index]
         if seed is None:
             return None
-        # Another seed than the last one, which would repeat the same episodes.
+        # The last seed itself would repeat the same episodes.
         return int(np.random.SeedSequence((seed, self.restarts[index])).generate_state(1)[0])
 
     def _cut_off(self, index: int) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
-        """The step of an environment that was restarted: it truncates the episode."""
+        """The step of a restarted environment, which truncates the episode."""
         observation, reset_info = self._begun_anew.pop(index)
         info = {
             "TimeLimit.truncated": True,

@@ -1,4 +1,4 @@
-"""Cache of compiled functions on disk. Without it the kernels are compiled again in each process."""
+"""Disk cache of compiled functions. Without it, each process compiles the kernels again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DIGEST_SIZE = sha256().digest_size
 
 
 class _WarnOnce:
-    """Warns once in a process why the kernels have to be compiled."""
+    """Warns once per process why the kernels must be compiled."""
 
     def __init__(self) -> None:
         self._has_warned = False
@@ -35,15 +35,15 @@ warn_once = _WarnOnce()
 
 
 class CheckedFile(IndexDataCacheFile):
-    """Cache files with a checksum. Without one, damaged machine code would be run."""
+    """Cache files with a checksum, so that damaged machine code is not executed."""
 
     def __init__(self, **arguments: Any) -> None:
         super().__init__(**arguments)
-        # Files that numba wrote without checksums count as another version, not as damaged.
+        # Treat files written by numba without checksums as another version, not as damaged.
         self._version = f"{numba.__version__} with digests"
 
     def _dump(self, obj: Any) -> bytes:
-        # pickle ignores what follows the object.
+        # pickle ignores trailing data.
         content: bytes = super()._dump(obj)
         return content + sha256(content).digest()
 
@@ -57,10 +57,10 @@ class CheckedFile(IndexDataCacheFile):
 
 class KernelCache(FunctionCache):
     """
-    Cache of a compiled function on disk. If it cannot be read or written, the function is compiled again.
+    Disk cache of a compiled function. If it cannot be read or written, the function is compiled again.
 
     :param function: the function
-    :raises RuntimeError: if there is no folder that can be written to
+    :raises RuntimeError: if no folder is writable
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -82,7 +82,7 @@ class KernelCache(FunctionCache):
         except Exception as error:  # a damaged pickle can raise any error
             warn_once(f"numba's cache in {self.cache_path} cannot be read ({_describe(error)})")
             try:
-                # Without a new index, what is compiled now could not be saved.
+                # Reset the damaged index, so that the newly compiled function can be saved.
                 self.flush()
             except OSError:
                 self.disable()
@@ -100,7 +100,7 @@ class KernelCache(FunctionCache):
 
 
 class NoCache(NullCache):
-    """No cache. Warns when a function is compiled."""
+    """Stands in for a cache that is not available. Warns when a function is compiled."""
 
     def load_overload(self, sig: Any, target_context: Any) -> None:
         """
@@ -113,13 +113,13 @@ class NoCache(NullCache):
 
 def keep(dispatcher: Any) -> None:
     """
-    Cache a function on disk, if there is a folder to write to.
+    Cache a function on disk, if a folder is writable.
 
     :param dispatcher: the function, compiled by numba
     """
     try:
         dispatcher._cache = KernelCache(dispatcher.py_func)
-    except RuntimeError:  # there is no folder to write to
+    except RuntimeError:  # no folder is writable
         dispatcher._cache = NoCache()
 
 

@@ -1,4 +1,4 @@
-"""Compilation with numba, or none where numba cannot be used."""
+"""Compilation with numba, or plain Python where numba cannot be used."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ try:
     AVAILABLE = not getattr(numba.config, "DISABLE_JIT", 0)
     #: why numba cannot be used, empty if it can
     REASON = "" if AVAILABLE else "NUMBA_DISABLE_JIT is set"
-except Exception as error:  # with a NumPy that it does not support, numba raises other errors than ImportError
+except Exception as error:  # with an unsupported version of NumPy, numba raises other errors than ImportError
     AVAILABLE = False
     REASON = f"{type(error).__name__}: {error}"
 
@@ -38,7 +38,7 @@ def jit(function: Function, forceinline: bool = False) -> Function:
 def inlined(function: Function) -> Function:
     """
     :func:`jit`, inlined into compiled functions that call it. For functions called for each neighbour: passing a dozen
-    arrays takes longer than to read from them.
+    arrays takes longer than reading from them.
 
     :param function: the function
     :return: the compiled function, or ``function`` itself without numba

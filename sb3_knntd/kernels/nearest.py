@@ -51,11 +51,11 @@ def _first_on_lattice(scaled, axes, offsets, count):
 
     :param scaled: observation, scaled units, shape (obs_dim,)
     :param axes: see :func:`nearest_on_lattice`
-    :param offsets: likewise
-    :param count: number of points to find, at most the number of points there are
+    :param offsets: see :func:`nearest_on_lattice`
+    :param count: number of points to find, at most the number of points of the lattice
     :return: squared distances and indices, by (distance, index) but for rounding, shape (count,) each
     """
-    # The old and the new list. For each row: the squared distance of its coordinate, its next sum, its coordinate, and
+    # The new and the old list. For each row: the squared distance of its coordinate, its next sum, its coordinate, and
     # its position in the old list.
     floats, integers = np.empty((4, count)), np.empty((4, count), np.int64)
     sums, before, squares, nexts = floats[0], floats[1], floats[2], floats[3]
@@ -140,8 +140,8 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
     :param axes: the coordinates of all dimensions, concatenated, ascending in each, scaled units
     :param offsets: index of the first coordinate of each dimension, and the total number, shape (obs_dim + 1,), int64
     :param k: number of neighbours, at most the number of points
-    :param indices: to be filled, shape (k,), int64
-    :param distances: to be filled with squared distances, shape (k,)
+    :param indices: output, shape (k,), int64
+    :param distances: output, squared distances, shape (k,)
     """
     n_points = 1
     for j in range(len(scaled)):
@@ -166,8 +166,8 @@ def nearest_of_all(scaled, columns, k, indices, distances):
     :param scaled: observation, scaled units, shape (obs_dim,)
     :param columns: the points' coordinates, scaled units, shape (obs_dim, n_points)
     :param k: number of neighbours, at most the number of points
-    :param indices: to be filled, shape (k,), int64
-    :param distances: to be filled with squared distances, shape (k,)
+    :param indices: output, shape (k,), int64
+    :param distances: output, squared distances, shape (k,)
     """
     n_dims, n_points = columns.shape
     count = 0
@@ -205,8 +205,8 @@ def order_candidates(scaled, places, candidates, indices, distances):
     :param scaled: observations, scaled units, shape (batch, obs_dim)
     :param places: the points' coordinates, scaled units, shape (n_points, obs_dim)
     :param candidates: indices of points, at least k, shape (batch, n), int64
-    :param indices: to be filled, shape (batch, k), int64
-    :param distances: to be filled with squared distances, shape (batch, k)
+    :param indices: output, shape (batch, k), int64
+    :param distances: output, squared distances, shape (batch, k)
     """
     n_dims, k = places.shape[1], indices.shape[1]
     for row in range(len(scaled)):

@@ -1,4 +1,4 @@
-"""From an observation to the probabilities of its neighbours."""
+"""Perception: from an observation to its neighbours and their probabilities."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sb3_knntd.kernels.nearest import nearest_of_all, nearest_on_lattice
 
 
 class SearchKind(IntEnum):
-    """How neighbours are found: on a lattice, among all points, or before the kernel is called."""
+    """How neighbours are found: on a lattice, among all points, or outside the kernel, before it is called."""
 
     LATTICE = 0
     ALL_POINTS = 1
@@ -20,7 +20,7 @@ class SearchKind(IntEnum):
 
 
 class Weighting(IntEnum):
-    """How neighbours are weighted by distance. The names in lower case are the words that users pass."""
+    """How neighbours are weighted by distance. Users pass the names in lower case."""
 
     INVERSE_QUADRATIC = 0
     GAUSSIAN = 1
@@ -28,14 +28,14 @@ class Weighting(IntEnum):
 
 class PerceptionArguments(NamedTuple):
     """
-    What :func:`perceive` needs besides the observation.
+    Arguments of :func:`perceive` other than the observation.
 
     :param low: lower bounds, observation units, shape (obs_dim,)
     :param width: upper minus lower bounds, observation units, shape (obs_dim,)
-    :param limit: largest size of scaled values
+    :param limit: scaled values are clipped to [-limit, limit]
     :param search: a :class:`SearchKind`
     :param axes: of the lattice, see :func:`~sb3_knntd.kernels.nearest.nearest_on_lattice`
-    :param offsets: of the lattice, likewise
+    :param offsets: of the lattice, see :func:`~sb3_knntd.kernels.nearest.nearest_on_lattice`
     :param columns: coordinates of the points, see :func:`~sb3_knntd.kernels.nearest.nearest_of_all`
     :param weighting: a :class:`Weighting`
     :param bandwidth: h, scaled units
@@ -64,7 +64,7 @@ def are_within(observations, low, high):
 
 @jit
 def weigh(weighting, bandwidth, squared_distances):
-    """Replace squared distances, rising, shape (k,), by weights that sum to 1 (eqs. 5 and 6)."""
+    """Replace squared distances in ascending order, shape (k,), by weights that sum to 1 (eqs. 5 and 6)."""
     nearest, total = squared_distances[0], 0.0
     for i in range(len(squared_distances)):
         if weighting == Weighting.INVERSE_QUADRATIC:
@@ -82,12 +82,12 @@ def weigh(weighting, bandwidth, squared_distances):
 @jit
 def perceive(observation, arguments, indices, probabilities):
     """
-    Bounds, search and weights of one observation.
+    Scale an observation, find its neighbours and compute their probabilities.
 
     :param observation: observation units, shape (obs_dim,)
     :param arguments: see :class:`PerceptionArguments`
-    :param indices: to be filled, or with search ``OUTSIDE`` given, shape (k,), int64
-    :param probabilities: to be filled, shape (k,); with search ``OUTSIDE`` the squared distances are given in it
+    :param indices: output, shape (k,), int64; with search ``OUTSIDE``, input
+    :param probabilities: output, shape (k,); with search ``OUTSIDE``, it holds the squared distances on input
     """
     k = len(indices)
     if arguments.search != SearchKind.OUTSIDE:

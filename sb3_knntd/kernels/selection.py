@@ -1,4 +1,4 @@
-"""Action selection: from the values of the neighbours to an action, and the value of the state as a target."""
+"""Action selection: from the values of the neighbours to an action and the value of the state as a target."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sb3_knntd.kernels.traces import read_row
 
 
 class Target(IntEnum):
-    """What the value of the next state is. The names in lower case are the words that users pass."""
+    """The target value of the next state. Users pass the names in lower case."""
 
     SARSA = 0
     Q_LEARNING = 1
@@ -20,7 +20,7 @@ class Target(IntEnum):
 
 
 class Exploration(IntEnum):
-    """How an action is explored. The names in lower case are the words that users pass."""
+    """How actions are explored. Users pass the names in lower case."""
 
     EPSILON_GREEDY = 0
     SOFTMAX = 1
@@ -29,27 +29,28 @@ class Exploration(IntEnum):
 
 
 class Combination(IntEnum):
-    """One action is selected from the mean of the neighbours' rows, or one from each row, whose mean is taken."""
+    """Select one action from the mean of the neighbours' rows, or one from each row and average the actions."""
 
     OF_VALUES = 0
     OF_ACTIONS = 1
 
 
-#: Persistent actions: the greedy action is taken, or nothing has been drawn in this episode.
+#: Special values of persistent actions: take the greedy action; not yet drawn in this episode.
 GREEDY, UNDRAWN = -1, -2
 
 
 class SelectionArguments(NamedTuple):
     """
-    What action selection needs besides values.
+    Arguments of action selection other than values.
 
     :param combination: a :class:`Combination`
     :param target: a :class:`Target`
     :param exploration: an :class:`Exploration`
-    :param random_ties: whether one of several equal best actions is drawn, in place of the first
-    :param min_persistence: mean number of steps, at least, for which a shared draw is kept
-    :param persistence_share: or the share of an episode, if that is longer
-    :param factors: where the columns of each action factor begin, and the end, shape (n_factors + 1,), int64
+    :param random_ties: whether ties between best actions are broken at random, otherwise the first is taken
+    :param min_persistence: lower limit of the mean number of steps for which a shared draw is kept
+    :param persistence_share: share of an episode for which a shared draw is kept on average, if that is longer
+    :param factors: index of the first column of each action factor, and the number of columns, shape (n_factors + 1,),
+        int64
     :param action_points: the action of each column, shape (n_actions, action_dim), action units
     """
 
@@ -65,13 +66,13 @@ class SelectionArguments(NamedTuple):
 
 @inlined
 def pick(uniform, n):
-    """One of n, by a uniform random number."""
+    """An integer in [0, n) from a uniform random number."""
     return min(np.int64(uniform * n), n - 1)
 
 
 @inlined
 def largest(values, first, end):
-    """The largest value from ``first`` to before ``end``."""
+    """The largest of ``values[first:end]``."""
     value = values[first]
     for action in range(first + 1, end):
         if values[action] > value:
@@ -81,7 +82,7 @@ def largest(values, first, end):
 
 @inlined
 def greedy_action(values, first, end, uniform, random_ties):
-    """The best action from ``first`` to before ``end``: one of several equal ones is drawn, or the first taken."""
+    """The best action in ``[first, end)``; ties are broken at random, or the first is taken."""
     value = largest(values, first, end)
     best, ties = first, 0
     for action in range(end - 1, first - 1, -1):
@@ -111,7 +112,7 @@ def _softmax(values, temperature, shares):
 
 @inlined
 def _explore(values, uniforms, rate, exploration, random_ties, shares):
-    """The action to take (eqs. 9 and 10); ``shares`` are the probabilities of all actions where they are needed."""
+    """The action to take (eqs. 9 and 10). With softmax, the probabilities of all actions are written to ``shares``."""
     n_actions = len(values)
     if exploration == Exploration.EPSILON_GREEDY:
         if uniforms[0] < rate:
@@ -204,16 +205,16 @@ def _select_from_each(indices, probabilities, uniforms, rate, persistent, state,
 @inlined
 def select(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action):
     """
-    The action to take in one state (eqs. 8 to 10; eqs. 19 to 21 and 27).
+    Select the action in one state (eqs. 8 to 10; eqs. 19 to 21 and 27).
 
     :param indices: neighbours, shape (k,)
     :param probabilities: of the neighbours, shape (k,)
     :param uniforms: random numbers in [0, 1), shape (n_uniforms,)
     :param rate: ε or the temperature
-    :param persistent: columns that are being explored, ``GREEDY`` or ``UNDRAWN``, shape (n_factors,)
+    :param persistent: columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (n_factors,)
     :param state: see :mod:`sb3_knntd.kernels.state`
-    :param action_indices: to be filled with the column that each neighbour selects, one a factor, shape (k, n_factors)
-    :param mean_action: to be filled with the mean of the action points, shape (action_dim,)
+    :param action_indices: output, the column that each neighbour selects for each factor, shape (k, n_factors)
+    :param mean_action: output, the mean of the action points, shape (action_dim,)
     :return: the value of the state as a target (eqs. 11, 12 and 25)
     """
     if state.combination == Combination.OF_VALUES:
@@ -226,7 +227,7 @@ def select(indices, probabilities, uniforms, rate, persistent, state, action_ind
 @jit
 def greedy_and_given_value(indices, probabilities, columns, state):
     """
-    The value of a state's greedy action, and that of a given one.
+    The values of the greedy action and of a given action in a state.
 
     :param indices: neighbours, shape (k,)
     :param probabilities: of the neighbours, shape (k,)
@@ -253,16 +254,16 @@ def greedy_and_given_value(indices, probabilities, columns, state):
 @jit
 def persist(uniforms, rate, lengths, env, selection, persistent):
     """
-    Keep what is being explored, or draw anew whether to explore and what. On average a draw is kept for
-    ``min_persistence`` steps, or for ``persistence_share`` of an episode if that is longer. An episode is taken to be
-    as long as the mean one, or as this one is already.
+    Keep the persistent action, or redraw whether to explore and which columns. On average a draw is kept for
+    ``min_persistence`` steps, or for ``persistence_share`` of an episode if that is longer. The expected length of an
+    episode is the mean length, or the current number of steps if that is larger.
 
     :param uniforms: random numbers in [0, 1), of which the first 2 + n_factors are used
     :param rate: ε, the share of draws that explore
     :param lengths: see :func:`count_steps`
-    :param env: which environment
+    :param env: index of the environment
     :param selection: see :class:`SelectionArguments`
-    :param persistent: columns that are being explored, ``GREEDY`` or ``UNDRAWN``, shape (n_factors,)
+    :param persistent: columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (n_factors,); updated in place
     """
     steps = max(selection.min_persistence, selection.persistence_share * max(lengths[0], lengths[1 + env]))
     if persistent[0] == UNDRAWN or uniforms[0] * steps < 1.0:
@@ -274,11 +275,12 @@ def persist(uniforms, rate, lengths, env, selection, persistent):
 @jit
 def count_steps(lengths, ended):
     """
-    Keep the mean length of episodes.
+    Update the mean length of episodes.
 
-    :param lengths: the mean length of the episodes so far, in which the last one counts a fifth (0 if none has ended),
-        and the number of steps of the present episode of each environment, shape (1 + n_envs,)
-    :param ended: whether the step just made has ended it, shape (n_envs,), bool
+    :param lengths: the moving average of the lengths of episodes, with weight 0.2 of the last one (0 if none has
+        ended), and the number of steps of the current episode in each environment, shape (1 + n_envs,); updated in
+        place
+    :param ended: whether the current step has ended the episode, shape (n_envs,), bool
     """
     for env in range(len(ended)):
         lengths[1 + env] += 1.0

@@ -1,9 +1,9 @@
 """
 All arrays and numbers that a learning step works on, as one object for compiled functions.
 
-To take in one object costs numba a microsecond, to take in its arrays one by one several. Its fields are the named
-tuples that the kernels declare beside their functions: a new array is a line in one of them, and its value is given by
-name where that tuple is made.
+Unboxing one object takes numba a microsecond; unboxing its arrays separately takes several. The fields are those of the
+named tuples that the kernels declare beside their functions. To add an array, add a field to one of them, and pass its
+value by name where that tuple is created.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from sb3_knntd.kernels.traces import TableArrays, TraceArrays
 
 class UpdateConfig(NamedTuple):
     """
-    Which form the update has.
+    The variant of the update.
 
     :param gamma: γ
-    :param normalized: whether the step is α / Σp² in place of α
-    :param accumulating: whether traces accumulate (eq. 15) in place of being replaced (eq. 16)
+    :param normalized: whether the step size is α / Σp² instead of α
+    :param accumulating: whether traces are accumulating (eq. 15) instead of replacing (eq. 16)
     :param reset_other_actions: whether a replacing trace clears those of the other actions
     """
 
@@ -38,8 +38,8 @@ class UpdateConfig(NamedTuple):
 
 class EpisodeArrays(NamedTuple):
     """
-    Where each environment is in its episode. The first axis of the first four is that of the state that was left,
-    ``CURRENT``, of the one that it led to, ``NEXT``, and of the last one before a truncation, ``TERMINAL``.
+    The state of the episode in each environment. The first axis of the first four arrays is: the state before the step,
+    ``CURRENT``; the state after it, ``NEXT``; and the last state before a truncation, ``TERMINAL``.
 
     :param indices: neighbours, shape (3, n_envs, k), int64
     :param probabilities: of the neighbours, shape (3, n_envs, k)
@@ -47,7 +47,7 @@ class EpisodeArrays(NamedTuple):
     :param actions: means of the action points, shape (3, n_envs, action_dim)
     :param truncated: whether the episode was truncated, shape (n_envs,), bool
     :param last_observations: the last observation before the truncation, shape (n_envs, obs_dim)
-    :param persistent: columns that are being explored, ``GREEDY`` or ``UNDRAWN``, shape (n_envs, n_factors), int64
+    :param persistent: columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (n_envs, n_factors), int64
     :param lengths: see :func:`~sb3_knntd.kernels.selection.count_steps`
     """
 
@@ -75,16 +75,16 @@ class RandomRows(NamedTuple):
 
 class WorkArrays(NamedTuple):
     """
-    Work space, and sums for the log.
+    Work space, bounds, and sums for the log.
 
     :param means: shape (n_actions,)
     :param row: shape (n_actions,)
     :param target_values: shape (n_envs,)
     :param corrections: shape (n_envs,)
     :param places: shape (n_envs, k), int64
-    :param sums: of the sizes of the TD errors, of the values, and the number of both, shape (3,)
-    :param value_bound: no value of the table is larger in size, shape (1,); infinity where that is not known
-    :param trace_bound: no trace is larger, shape (1,)
+    :param sums: sum of the absolute TD errors, sum of the values, and number of both, shape (3,)
+    :param value_bound: upper bound of the absolute values of the table, shape (1,); infinity if unknown
+    :param trace_bound: upper bound of the traces, shape (1,)
     """
 
     means: np.ndarray
@@ -97,7 +97,7 @@ class WorkArrays(NamedTuple):
     trace_bound: np.ndarray
 
 
-#: The declarations of the fields, whose names all differ.
+#: The named tuples that declare the fields; field names are unique.
 GROUPS = (
     PerceptionArguments,
     SelectionArguments,
@@ -117,14 +117,14 @@ if AVAILABLE:
 
     @structref.register
     class KernelStateType(types.StructRef):
-        """numba's type of a kernel state: that of its fields."""
+        """numba's type of a kernel state, determined by the types of its fields."""
 
         def preprocess_fields(self, fields):
-            """A field is a variable, whatever constant it was made of."""
+            """Replace literal types: a field is a variable even if it was set from a constant."""
             return tuple((name, types.unliteral(field)) for name, field in fields)
 
     class KernelState(structref.StructRefProxy):
-        """A kernel state as Python sees it, made of the values of ``GROUPS`` in their order."""
+        """A kernel state in Python, created from the values of ``GROUPS`` in their order."""
 
         def __new__(cls, *fields):
             return structref.StructRefProxy.__new__(cls, *fields)
@@ -134,8 +134,8 @@ if AVAILABLE:
     @intrinsic
     def borrow(typing_context, group):
         """
-        :param group: named tuple of arrays and numbers
-        :return: the same, whose arrays are not counted references: whoever made them keeps them
+        :param group: tuple of arrays and numbers
+        :return: the same without counting references to the arrays: the caller must keep them alive
         """
 
         def without_owner(context, builder, kind, value):
@@ -155,7 +155,7 @@ if AVAILABLE:
 
         return group(group), generate
 
-    #: By name, which kinds of states there are; numba keeps on disk what is compiled for a name, not for a type.
+    #: Types of states by name: numba can cache functions of a literal name on disk, but not functions of a type.
     _KINDS: dict[str, KernelStateType] = {}
 
     @intrinsic
@@ -173,10 +173,10 @@ if AVAILABLE:
     @intrinsic(prefer_literal=True)
     def state_at(typing_context, address, kind):
         """
-        To take in a state by its address saves 0.6 µs of each step, see docs/performance.md.
+        Get a state from its address. This saves 0.6 µs per step compared with unboxing it, see docs/performance.md.
 
-        :param address: where a state is that somebody keeps
-        :param kind: what :func:`address_of` named it
+        :param address: address of a state, which the caller must keep alive
+        :param kind: name of its type, from :func:`address_of`
         :return: the state
         """
         state = _KINDS[kind.literal_value]
@@ -185,7 +185,7 @@ if AVAILABLE:
             proxy = cgutils.create_struct_proxy(state)(context, builder)
             proxy.meminfo = builder.inttoptr(arguments[0], proxy.meminfo.type)
             value = proxy._getvalue()
-            # For the variable that it becomes, which counts as one more reference to it.
+            # numba decrements the reference count when the variable goes out of scope.
             context.nrt.incref(builder, state, value)
             return value
 
@@ -193,8 +193,8 @@ if AVAILABLE:
 
     def address_of(state: KernelState) -> tuple[int, str]:
         """
-        :param state: a state; it is there for as long as somebody keeps it
-        :return: its address, and the name of its kind
+        :param state: a state
+        :return: its address, valid as long as the state is alive, and the name of its type
         """
         kind = state._numba_type_
         _KINDS[kind.name] = kind
@@ -203,15 +203,15 @@ if AVAILABLE:
 else:
 
     def borrow(group):  # type: ignore[misc]
-        """The same: nobody counts references here that need not be."""
+        """Return the group itself."""
         return group
 
     def address_of(state):  # type: ignore[misc]
-        """The state itself, in place of its address."""
+        """Return the state itself in place of its address."""
         return state, ""
 
     def state_at(address, kind):  # type: ignore[misc]
-        """What :func:`address_of` was given."""
+        """Return the state that :func:`address_of` was called with."""
         return address
 
     KernelState = namedtuple("KernelState", FIELDS)  # type: ignore[no-redef, misc]
@@ -224,7 +224,7 @@ def _make_state(fields):
 
 def make_state(*groups: tuple[Any, ...]) -> KernelState:
     """
-    :param groups: a value of each of ``GROUPS``, in their order. Whoever has the state keeps their arrays
+    :param groups: an instance of each of ``GROUPS``, in their order. The caller must keep their arrays alive
     :return: all their fields as one object
     """
     state: KernelState = _make_state(tuple(chain.from_iterable(groups)))

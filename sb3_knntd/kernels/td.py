@@ -34,13 +34,13 @@ from sb3_knntd.kernels.traces import (
     stored_value,
 )
 
-#: Which state's arrays: that the environment left, that it is in, or the last one before a truncation.
+#: Indices of states in the arrays: before the step, after it, and the last one before a truncation.
 CURRENT, NEXT, TERMINAL = 0, 1, 2
 
 
-#: Outcomes of a step: done; more random numbers or more rows are needed; a rate is out of range, or what the
-#: environments returned is not finite, or values would become too large. Plain numbers: an enumeration's member takes
-#: half a microsecond to hand back.
+#: Outcomes of a step: success; more random numbers or more capacity are needed; a rate is out of range, an observation
+#: or reward is not finite, or values would become too large. Plain integers: returning a member of an enumeration takes
+#: half a microsecond.
 OK, NEED_RANDOM, NEED_CAPACITY, BAD_RATE, NOT_FINITE, DIVERGED = range(6)
 
 
@@ -54,7 +54,7 @@ def perceive_and_select(state, observation, uniforms, rate, which, env):
     :param uniforms: random numbers in [0, 1), shape (n_uniforms,)
     :param rate: ε or the temperature
     :param which: ``CURRENT``, ``NEXT`` or ``TERMINAL``
-    :param env: which environment
+    :param env: index of the environment
     :return: the value of the state as a target
     """
     indices, probabilities = state.indices[which, env], state.probabilities[which, env]
@@ -70,7 +70,7 @@ def perceive_and_select(state, observation, uniforms, rate, which, env):
 @jit
 def begin(state, observations, uniforms, rate):
     """
-    Perceive and select where every environment begins an episode.
+    Perceive and select in the first state of an episode in every environment.
 
     :param state: see :mod:`sb3_knntd.kernels.state`
     :param observations: observation units, shape (n_envs, obs_dim)
@@ -86,8 +86,8 @@ def begin(state, observations, uniforms, rate):
 @inlined
 def _stay_small(change, trace_decay, state):
     """
-    Whether no value can become larger than ``LARGEST_VALUE``, with each entry changed by at most ``change`` times its
-    trace. Looking at all entries is for the rare case that their known bound does not tell.
+    Whether all values stay within ``LARGEST_VALUE`` if each entry changes by at most ``change`` times its trace. All
+    entries are read only in the rare case that their known bound is not sufficient.
     """
     trace_bound = state.trace_bound[0] + 1.0 if state.accumulating else 1.0
     bound = state.value_bound[0] + change * trace_bound
@@ -103,16 +103,16 @@ def _stay_small(change, trace_decay, state):
 @inlined
 def update_table(state, target_values, rewards, ended, learning_rate, trace_decay):
     """
-    Compute the TD errors of the steps from the ``CURRENT`` states, and credit them along the traces (Algorithm 3), in
-    all environments at once: every value is read before any is changed.
+    Compute the TD errors of the steps from the ``CURRENT`` states, and update the table along the traces (Algorithm 3).
+    The update is synchronous: the values of all environments are read before any is changed.
 
     :param state: see :mod:`sb3_knntd.kernels.state`
-    :param target_values: values of the states that the steps led to, 0 where an episode was terminated, shape (n_envs,)
+    :param target_values: values of the next states, 0 where an episode was terminated, shape (n_envs,)
     :param rewards: shape (n_envs,)
-    :param ended: whether the episodes have, shape (n_envs,), bool
+    :param ended: whether the episodes have ended, shape (n_envs,), bool
     :param learning_rate: α
     :param trace_decay: λ
-    :return: ``OK``, or ``DIVERGED``, and then no value has been changed
+    :return: ``OK``, or ``DIVERGED``, in which case no value has been changed
     """
     indices, probabilities = state.indices[CURRENT], state.probabilities[CURRENT]
     chosen = state.action_indices[CURRENT]
@@ -154,7 +154,7 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
         for i in range(k):
             place, trace = places[env, i], probabilities[env, i] / clock[0]
             if place < 0:
-                # Another environment may have made it active meanwhile.
+                # Another environment may have activated it in this loop.
                 place = find(indices[env, i], slots)
                 if place < 0:
                     place = activate(indices[env, i], state, state)
@@ -186,7 +186,7 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
 
 @inlined
 def _advance(state):
-    """The states that the step led to are now those that the environments are in."""
+    """Copy the ``NEXT`` states to the ``CURRENT`` ones."""
     indices, probabilities, entries, actions = (
         state.indices,
         state.probabilities,
@@ -194,7 +194,7 @@ def _advance(state):
         state.actions,
     )
     _, n_envs, k, n_factors = entries.shape
-    # Elements are copied one by one: for arrays this small numba's slices take longer.
+    # Copy element by element: for arrays this small, numba's slices take longer.
     for env in range(n_envs):
         for j in range(actions.shape[2]):
             actions[CURRENT, env, j] = actions[NEXT, env, j]
@@ -207,7 +207,7 @@ def _advance(state):
 
 @inlined
 def has_capacity(state):
-    """Whether there is room for all points that the next step may come upon."""
+    """Whether the arrays have capacity for all new points of the next step."""
     n_envs, k = state.indices.shape[1:]
     most = n_envs * k
     if len(state.active_points) - state.n_active[0] < most:
@@ -217,7 +217,7 @@ def has_capacity(state):
 
 @inlined
 def _are_valid(learning_rate, trace_decay, rate, state):
-    """Whether scheduled parameters are in range; not a number never is."""
+    """Whether the scheduled parameters are in range. NaN is not."""
     if not (0.0 <= learning_rate < np.inf and 0.0 <= trace_decay <= 1.0):
         return False
     return 0.0 < rate < np.inf if state.exploration == Exploration.SOFTMAX else 0.0 <= rate <= 1.0
@@ -226,17 +226,17 @@ def _are_valid(learning_rate, trace_decay, rate, state):
 @jit
 def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate):
     """
-    Perceive and select in the states that the last actions led to, and learn from the steps.
+    Perceive the next states, select actions in them, and learn from the steps.
 
     :param state: see :mod:`sb3_knntd.kernels.state`
     :param observations: observation units, shape (n_envs, obs_dim)
     :param rewards: shape (n_envs,)
-    :param ended: whether the episodes have, shape (n_envs,), bool
+    :param ended: whether the episodes have ended, shape (n_envs,), bool
     :param learning_rate: α
     :param trace_decay: λ
     :param rate: ε or the temperature
-    :return: ``OK``; or ``NEED_RANDOM``, ``NEED_CAPACITY`` or ``BAD_RATE``, and then nothing has been done; or
-        ``NOT_FINITE`` or ``DIVERGED``, and then no value has been changed
+    :return: ``OK``; or ``NEED_RANDOM``, ``NEED_CAPACITY`` or ``BAD_RATE``, in which case nothing has been changed; or
+        ``NOT_FINITE`` or ``DIVERGED``, in which case no value has been changed
     """
     target_values = state.target_values
     if state.n_taken[0] == len(state.rows):
@@ -279,7 +279,7 @@ def _learn_at(kind):
 
 def learn_with(state):
     """
-    :param state: see :mod:`sb3_knntd.kernels.state`; to be kept for as long as the function is
+    :param state: see :mod:`sb3_knntd.kernels.state`; the caller must keep it alive as long as the function is used
     :return: :func:`learn` with this state, a function of its other arguments
     """
     address, kind = address_of(state)
@@ -289,14 +289,14 @@ def learn_with(state):
 @jit
 def recommend(state, observations, uniforms, indices, probabilities, action_indices):
     """
-    The columns that the neighbours select greedily in each of a batch of states.
+    Find the columns that the neighbours select greedily for a batch of observations.
 
     :param state: with greedy selection, see :mod:`sb3_knntd.kernels.state`
     :param observations: observation units, shape (batch, obs_dim)
     :param uniforms: zeros, shape (n_uniforms,)
-    :param indices: to be filled, or with search ``OUTSIDE`` given, shape (batch, k), int64
-    :param probabilities: to be filled, shape (batch, k); with search ``OUTSIDE`` the squared distances are given in it
-    :param action_indices: to be filled, shape (batch, k, n_factors), int64
+    :param indices: output, shape (batch, k), int64; with search ``OUTSIDE``, input
+    :param probabilities: output, shape (batch, k); with search ``OUTSIDE``, it holds the squared distances on input
+    :param action_indices: output, shape (batch, k, n_factors), int64
     """
     for row in range(len(observations)):
         perceive(observations[row], state, indices[row], probabilities[row])
@@ -337,13 +337,13 @@ def update(
     :param rewards: shape (n,)
     :param next_observations: observation units, shape (n, obs_dim)
     :param terminated: whether the next state is terminal, shape (n,), bool
-    :param ended: whether the next transition does not go on from this one, shape (n,), bool
-    :param found: with search ``OUTSIDE`` the neighbours before and after, shape (2, n, k), int64; else not used
-    :param distances: with search ``OUTSIDE`` their squared distances, shape (2, n, k); else not used
-    :param first: number of the transition to begin with
+    :param ended: whether the next transition does not continue this one, shape (n,), bool
+    :param found: with search ``OUTSIDE``, the neighbours of both observations, shape (2, n, k), int64; otherwise unused
+    :param distances: with search ``OUTSIDE``, their squared distances, shape (2, n, k); otherwise unused
+    :param first: index of the first transition to learn from
     :param learning_rate: α
     :param trace_decay: λ
-    :return: how many transitions have been learned from, and ``OK``, ``NEED_CAPACITY`` or ``DIVERGED``
+    :return: the index of the next transition, and ``OK``, ``NEED_CAPACITY`` or ``DIVERGED``
     """
     target_values, last = state.target_values, np.empty(1, np.bool_)
     reward = np.empty(1)

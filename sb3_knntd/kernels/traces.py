@@ -1,18 +1,19 @@
 """
 The Q-table and its eligibility traces.
 
-Eligibility traces need not touch the table. Q += α δ e and e *= γ λ over all entries equal one running sum: with c the
-product of the decays so far and G = Σ α δ c, an entry whose trace was set to e at c₀ has gained (e/c₀)(G - G₀) since
-(Wiering and Schmidhuber, Fast online Q(λ), 1998). The points that have a trace are the *active* ones. For each of their
-entries the traces hold x = e/c₀ of every environment and a base, so that
+Updates along the eligibility traces need not write to the table. Q += α δ e and e *= γ λ over all entries reduce to one
+running sum: with c the product of all decays so far and G = Σ α δ c, an entry whose trace was set to e at c₀ has since
+changed by (e/c₀)(G - G₀) (Wiering and Schmidhuber, Fast online Q(λ), 1998). Points that have a trace are called
+*active*. For each of their entries, the arrays store x = e/c₀ for each environment and a base, so that
 
     Q = base + share · Σ_env x G,    share = max_env x / Σ_env x
 
-where share makes the errors of several environments a mean. All traces decay alike, so that share changes only when a
-trace is set. A step costs O(k · n_actions), whatever λ, the length of the episode and the size of the table.
+where share turns the sum of the errors of several environments into a mean. All traces decay at the same rate, so share
+changes only when a trace is set. A step costs O(k · n_actions), independent of λ, the length of the episode and the
+size of the table.
 
-A hash is an array (size, 2), int64, of points and places, filled by linear probing. Its size is a power of two, and a
-point of -1 marks a free slot.
+A hash maps points to places. It is an array of (point, place), shape (size, 2), int64, filled by linear probing. Its
+size is a power of two; the point -1 marks a free slot.
 """
 
 from __future__ import annotations
@@ -23,12 +24,11 @@ import numpy as np
 
 from sb3_knntd.kernels.jit import inlined, jit
 
-#: A trace below this has no weight in a float64 that the trace above it moves; it is dropped.
+#: Smaller traces are dropped: their effect is below the precision of a float64.
 LEAST_TRACE = 1e-18
-#: When c falls below this, all values are brought up to date and c starts at 1: x grows as 1/c, and digits are lost
-#: with it.
+#: When c falls below this, all values are brought up to date and c is reset to 1: x grows as 1/c, which loses digits.
 LEAST_CLOCK = 1e-4
-#: Values larger than this have diverged. It leaves room for sums of them, in float32 as well.
+#: Larger values are considered diverged. Sums of values still fit into float32.
 LARGEST_VALUE = 1e30
 
 
@@ -37,11 +37,11 @@ class TableArrays(NamedTuple):
     The Q-table.
 
     :param values: shape (n_rows, n_actions)
-    :param visited: which rows have been learned at, a bit each, uint8; empty if every row has been
-    :param row_points: the point of each row, shape (n_rows,), int64; empty if the points are the rows
-    :param row_slots: hash of the rows by point; empty if the points are the rows
-    :param n_rows: number of rows in use, shape (1,), int64; not used if the points are the rows
-    :param initial_value: value of a point that has no row
+    :param visited: a bit for each row: whether it has been updated by learning, uint8; empty if every row has
+    :param row_points: the point of each row, shape (n_rows,), int64; empty if row i is that of point i
+    :param row_slots: hash from points to rows; empty if row i is that of point i
+    :param n_rows: number of rows in use, shape (1,), int64; not used if row i is that of point i
+    :param initial_value: value of points without a row
     """
 
     values: np.ndarray
@@ -58,7 +58,7 @@ class TraceArrays(NamedTuple):
 
     :param active_points: shape (capacity,), int64
     :param active_entries: x of each environment, share and base of each entry, shape (capacity, n_actions, n_envs + 2)
-    :param active_slots: hash of the places of the active points
+    :param active_slots: hash from points to places in these arrays
     :param n_active: number of active points, shape (1,), int64
     :param clock: c, and G of each environment, shape (1 + n_envs,)
     """
@@ -72,7 +72,7 @@ class TraceArrays(NamedTuple):
 
 @inlined
 def _probe(point, slots):
-    """The slot of a point, or the free one where it belongs."""
+    """The slot of a point, or the free slot where it would be inserted."""
     mask = len(slots) - 1
     mixed = np.uint64(point) * np.uint64(0x9E3779B97F4A7C15)
     slot = np.int64((mixed ^ (mixed >> np.uint64(32))) & np.uint64(mask))
@@ -83,14 +83,14 @@ def _probe(point, slots):
 
 @inlined
 def find(point, slots):
-    """The place of a point, -1 if it has none."""
+    """The place of a point, -1 if it is not in the hash."""
     slot = _probe(point, slots)
     return slots[slot, 1] if slots[slot, 0] == point else -1
 
 
 @jit
 def insert(point, place, slots):
-    """Give a point a place."""
+    """Insert a point and its place into a hash."""
     slot = _probe(point, slots)
     slots[slot, 0] = point
     slots[slot, 1] = place
@@ -98,7 +98,7 @@ def insert(point, place, slots):
 
 @jit
 def rehash(points, count, slots):
-    """Make a hash of the places of the first ``count`` points."""
+    """Fill a hash with the first ``count`` points, each at its index."""
     slots[:, 0] = -1
     for place in range(count):
         insert(points[place], place, slots)
@@ -136,14 +136,14 @@ def read_active_row(entries, place, clock, row):
 
 @inlined
 def stored_value(point, action, values, row_slots, initial_value):
-    """The value that the table has for an entry."""
+    """The value of an entry in the table."""
     row = row_of(point, row_slots)
     return values[row, action] if row >= 0 else initial_value
 
 
 @inlined
 def read_stored_row(point, values, row_slots, initial_value, row):
-    """Write the values that the table has for a point into ``row``, shape (n_actions,)."""
+    """Write the values of a point in the table into ``row``, shape (n_actions,)."""
     place = row_of(point, row_slots)
     if place >= 0:
         for action in range(len(row)):
@@ -158,8 +158,8 @@ def read_row(point, values, row_slots, initial_value, entries, slots, clock, row
     """
     Write the values of a point into ``row``, shape (n_actions,).
 
-    The arrays are those of :class:`TableArrays` and :class:`TraceArrays`, taken out once before a loop over points:
-    numba counts references to an array each time it is.
+    Takes the arrays of :class:`TableArrays` and :class:`TraceArrays` separately, so that callers read them once before
+    a loop over points: numba counts references each time an array is read from a tuple.
     """
     place = find(point, slots)
     if place >= 0:
@@ -170,7 +170,7 @@ def read_row(point, values, row_slots, initial_value, entries, slots, clock, row
 
 @jit
 def activate(point, table, traces):
-    """Make a point active, and give it a row of the table if it has none; returns its place."""
+    """Make a point active, and add a row to the table if it has none; its place."""
     row = row_of(point, table.row_slots)
     if row < 0:
         row = table.n_rows[0]
@@ -195,7 +195,7 @@ def activate(point, table, traces):
 
 @inlined
 def set_trace(entries, place, action, env, trace, clock):
-    """Set x of an active entry; its value stays what it is."""
+    """Set x of an active entry without changing its value."""
     n_envs = len(clock) - 1
     if n_envs == 1:
         entries[place, action, 2] += (entries[place, action, 0] - trace) * clock[1]
@@ -220,7 +220,7 @@ def _reshare(entries, place, action):
 
 @jit
 def write_back(table, traces):
-    """Write the values of all active points into the table. Nothing else changes."""
+    """Write the values of all active points into the table. The traces do not change."""
     for place in range(traces.n_active[0]):
         row = row_of(traces.active_points[place], table.row_slots)
         for action in range(traces.active_entries.shape[1]):
@@ -229,7 +229,7 @@ def write_back(table, traces):
 
 @jit
 def largest_size(table, traces):
-    """The largest size that a value of the table has."""
+    """The largest absolute value in the table."""
     values, clock, largest = table.values, traces.clock, 0.0
     n_rows = len(values) if len(table.row_slots) == 0 else table.n_rows[0]
     for row in range(n_rows):
@@ -243,7 +243,7 @@ def largest_size(table, traces):
 
 @jit
 def adopt(table, traces):
-    """Have the active points take over the values that the table has for them; their traces stay."""
+    """Set the values of the active points to those in the table. The traces do not change."""
     entries, clock = traces.active_entries, traces.clock
     for place in range(traces.n_active[0]):
         row = row_of(traces.active_points[place], table.row_slots)
@@ -254,7 +254,7 @@ def adopt(table, traces):
 
 @jit
 def _rebase(entries, place, clock):
-    """Bring the bases of an active point up to date and its x to what they are with c = 1; whether a trace is left."""
+    """Rewrite the bases and the x of an active point for c = 1 and G = 0; whether it still has a trace."""
     n_envs, active = len(clock) - 1, False
     if n_envs == 1:
         here, decay, gained = entries[place], clock[0], clock[1]
@@ -282,7 +282,7 @@ def _rebase(entries, place, clock):
 
 @jit
 def flush(table, traces):
-    """Bring all values up to date, drop the points that have no trace left, and start c and G afresh."""
+    """Bring all values up to date, drop the points whose traces have decayed, and reset c and G."""
     n_envs = len(traces.clock) - 1
     points, entries = traces.active_points, traces.active_entries
     kept = 0
@@ -308,7 +308,7 @@ def end_episode(env, table, traces):
     clock = traces.clock
     if len(clock) == 2:
         write_back(table, traces)
-        # The last inserted first, so that no free slot cuts off the way to one still to be found.
+        # Remove points in reverse order of insertion, so that no free slot interrupts the probing of another point.
         for place in range(traces.n_active[0] - 1, -1, -1):
             traces.active_slots[_probe(traces.active_points[place], traces.active_slots), 0] = -1
         traces.n_active[0] = 0
@@ -322,7 +322,7 @@ def end_episode(env, table, traces):
 
 @jit
 def read_rows(points, table, traces, rows):
-    """Write the values of points, shape (n,), into ``rows``, shape (n, n_actions), of the table's type."""
+    """Write the values of points, shape (n,), into ``rows``, shape (n, n_actions), the table's dtype."""
     values, row_slots, initial_value = table.values, table.row_slots, table.initial_value
     entries, slots, clock = traces.active_entries, traces.active_slots, traces.clock
     for i in range(len(points)):

@@ -1,4 +1,4 @@
-"""Learning from steps: the torch reference, and the same compiled."""
+"""Learners: the torch reference and the compiled implementation."""
 
 from __future__ import annotations
 

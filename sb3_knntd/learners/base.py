@@ -1,4 +1,4 @@
-"""What every learner does: one step of learning in all environments, and updates from given transitions."""
+"""Interface of learners: a learning step in all environments, and updates from given transitions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sb3_knntd.perception import Perceiver
 from sb3_knntd.q_table import QTable
 from sb3_knntd.q_table.active_traces import SMALLEST_CAPACITY
 
-#: What numbers from a file may differ by from the sum that they must have.
+#: Tolerance for sums of numbers from a file.
 ROUNDING = 1e-6
 
 DIVERGENCE = (
@@ -43,8 +43,8 @@ class Rates(NamedTuple):
 
     def check(self, selector: ActionSelector) -> None:
         """
-        :param selector: what ``exploration`` is the rate of
-        :raises ValueError: if a rate is out of range; the message says which
+        :param selector: tells whether ``exploration`` is ε or a temperature
+        :raises ValueError: if a rate is out of range; the message names it
         """
         check_number("learning_rate at this step", self.learning_rate, 0.0)
         check_number("trace_decay at this step", self.trace_decay, 0.0, 1.0)
@@ -58,7 +58,7 @@ def update_rates(learning_rate: float, trace_decay: float) -> Rates:
     """
     :param learning_rate: α, at least 0
     :param trace_decay: λ, in [0, 1]
-    :return: the rates of an update in which nothing is explored
+    :return: the rates of an update, without exploration
     :raises ValueError: if one is out of range
     """
     learning_rate = check_number("learning_rate", learning_rate, 0.0)
@@ -67,15 +67,15 @@ def update_rates(learning_rate: float, trace_decay: float) -> Rates:
 
 class Transitions(NamedTuple):
     """
-    Steps to learn from, in the order in which they were made.
+    Transitions to learn from, in temporal order.
 
     :param observations: shape (n, *obs_shape), observation units
-    :param actions: as the policy numbers them, shape (n,), integers from 0; or vectors, shape (n, action_dim)
+    :param actions: indices of actions, counted from 0, shape (n,); or vectors, shape (n, action_dim)
     :param rewards: shape (n,)
-    :param next_observations: what the steps led to, before a reset, shape (n, *obs_shape)
-    :param terminated: whether the next state is terminal, and worth nothing, shape (n,), bool
-    :param ended: whether the next transition does not go on from this one: at the end of an episode, at a truncation,
-        or everywhere for single steps, shape (n,), bool
+    :param next_observations: observations after the steps, before a reset, shape (n, *obs_shape), observation units
+    :param terminated: whether the next state is terminal, with value 0, shape (n,), bool
+    :param ended: whether the next transition does not continue this one: at the end of an episode, at a truncation, or
+        everywhere for single steps, shape (n,), bool
     """
 
     observations: np.ndarray
@@ -87,10 +87,10 @@ class Transitions(NamedTuple):
 
     def columns(self, selector: ActionSelector, obs_dim: int) -> np.ndarray:
         """
-        :param selector: knows which columns of the table stand for actions
+        :param selector: maps actions to columns of the table
         :param obs_dim: number of dimensions of an observation
-        :return: the columns that stand for the actions, one for each factor, shape (n, n_factors), int64
-        :raises ValueError: if an array has another length or shape than the others, or holds what is not finite
+        :return: the columns of the actions, one for each factor, shape (n, n_factors), int64
+        :raises ValueError: if the length or shape of an array does not fit, or a value is not finite
         """
         n = len(self.rewards)
         sizes = {"observations": obs_dim, "next_observations": obs_dim, "rewards": 1, "terminated": 1, "ended": 1}
@@ -108,17 +108,17 @@ class Transitions(NamedTuple):
 
 class Learner(ABC):
     """
-    Algorithms 1 to 3 of the paper, for several environments in step. Between calls it knows where each episode is:
-    perception and selected action at the current observation, and traces.
+    Algorithms 1 to 3 of the paper, for several synchronous environments. Between calls it stores the state of each
+    episode: the perception and the selected action at the current observation, and the traces.
 
     :param perceiver: finds and weighs the neighbours of an observation
     :param table: the Q-table
     :param selector: selects actions
     :param n_envs: number of environments
-    :param config: which form the update has
+    :param config: variant of the update
     """
 
-    #: whether it knows where the episodes are; if not, :meth:`begin` has to be called
+    #: whether the state of the episodes is known; if not, call :meth:`begin`
     in_episodes = False
 
     def __init__(
@@ -137,7 +137,7 @@ class Learner(ABC):
     def actions(self) -> np.ndarray:
         """
         The action to take in each environment: its index, shape (n_envs,), int64, or a vector, shape (n_envs,
-        action_dim). It is valid until the next call of :meth:`begin` or :meth:`step`.
+        action_dim). The array is valid until the next call of :meth:`begin` or :meth:`step`.
         """
 
     @abstractmethod
@@ -160,48 +160,47 @@ class Learner(ABC):
         rates: Rates,
     ) -> None:
         """
-        Learn from what the last actions led to, and select the next.
+        Learn from the transitions of the last actions, and select the next actions.
 
-        :param observations: the present observations (after a reset where an episode ended), shape (n_envs, *obs_shape)
+        :param observations: the current observations (after a reset where an episode ended), shape (n_envs, *obs_shape)
         :param rewards: shape (n_envs,)
         :param ended: whether the episode ended, shape (n_envs,), bool
-        :param truncated: the environments whose episode ended by a time limit, and the true last observation of each of
-            these, shape obs_shape
+        :param truncated: the last observation before the reset, shape obs_shape, of each environment whose episode was
+            truncated
         :param rates: the scheduled parameters
-        :raises ValueError: if an observation, a reward or a rate is not finite or out of range. No value has been
-            changed then
-        :raises FloatingPointError: if values would diverge. No value has been changed then
+        :raises ValueError: if an observation or reward is not finite, or a rate is out of range; the table is unchanged
+        :raises FloatingPointError: if values would diverge; the table is unchanged
         """
 
     @abstractmethod
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         """
-        Learn from given transitions, one after the other, whatever policy made them. Episodes that go on keep their
-        traces.
+        Learn off-policy from given transitions, one after the other. The traces of the current episodes are not
+        affected.
 
-        The target is r + γ max Q(s', ·), for Ex⟨a⟩ r + γ Σ p(i) max Q(i, ·). λ is cut as in Watkins's Q(λ): traces are
-        dropped before an action that is worth less than the greedy one, and where an episode ends (Watkins 1989; Sutton
-        and Barto, 2nd ed., section 12.10). A continuous action is taken for the nearest action point.
+        The target is r + γ max Q(s', ·), for Ex⟨a⟩ r + γ Σ p(i) max Q(i, ·). Traces are cut as in Watkins's Q(λ):
+        before an action whose value is lower than that of the greedy one, and where an episode ends (Watkins 1989;
+        Sutton and Barto, 2nd ed., section 12.10). A continuous action is replaced by the nearest action point.
 
-        :param transitions: what to learn from
+        :param transitions: the transitions
         :param learning_rate: α, at least 0
         :param trace_decay: λ, in [0, 1]
-        :raises ValueError: if an argument does not fit, or is not finite. Nothing has been learned then
-        :raises FloatingPointError: if values would diverge. The transitions before have been learned from
+        :raises ValueError: if an argument is invalid or not finite; nothing has been learned
+        :raises FloatingPointError: if values would diverge; all transitions before have been learned from
         """
 
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
         """
-        Go on in the same episodes with other parameters.
+        Change parameters within the current episodes.
 
-        :param selector: selects actions, by as many random numbers as before
-        :param config: which form the update has
+        :param selector: selects actions; it must use the same number of random numbers as before
+        :param config: variant of the update
         """
         self.selector = selector
         self.config = config
 
     def abandon_episodes(self) -> None:
-        """Know of no episode: what is going on in the environments is not learned from."""
+        """Forget the current episodes: their next step is not learned from."""
         self.in_episodes = False
 
     @property
@@ -212,8 +211,8 @@ class Learner(ABC):
     @abstractmethod
     def summary(self) -> dict[str, float]:
         """
-        :return: ``td_error``, the mean absolute TD error, and ``q_mean``, the mean value of the states and actions
-            learned from, both since the last call; empty if nothing was learned
+        :return: ``td_error``, the mean absolute TD error, and ``q_mean``, the mean value Q(s, a) of the updated states
+            and actions, both since the last call; empty if there were no updates
         """
 
     @abstractmethod
@@ -224,17 +223,17 @@ class Learner(ABC):
 
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
         """
-        Take over the state of a learner of the same table. One of another number of environments or neighbours knows no
-        episode of these, and is ignored.
+        Restore the state of a learner of the same table. A state of another number of environments or neighbours is
+        ignored.
 
-        :param state_dict: what :meth:`state_dict` returned
-        :param strict: part of torch's signature; a state is always taken whole
-        :raises ValueError: if no learner can have returned it; the message says why
+        :param state_dict: the return value of :meth:`state_dict`
+        :param strict: has no effect, part of torch's signature
+        :raises ValueError: if the state is invalid; the message says why
         """
         in_episodes = getattr(entry(state_dict, "entries"), "shape", None) == self.shape
         if in_episodes:
             self._check_state(state_dict)
-            # One that has not begun yet.
+            # All zeros if it was saved outside of episodes.
             in_episodes = bool(state_dict["probabilities"].any())
         self._forget()
         self.in_episodes = in_episodes
@@ -243,11 +242,11 @@ class Learner(ABC):
 
     @abstractmethod
     def _forget(self) -> None:
-        """Drop all traces and what the entries that have one gained."""
+        """Drop all traces and the values of the entries with a trace."""
 
     @abstractmethod
     def _take_over(self, state_dict: dict[str, Any]) -> None:
-        """Take over a state that fits."""
+        """Restore a valid state."""
 
     def _check_state(self, state: dict[str, Any]) -> None:
         n_envs, k, n_factors = self.shape
@@ -270,6 +269,6 @@ class Learner(ABC):
         clock = checked_tensor(traces, "pace", (1 + n_envs,), th.float64)
         if not LEAST_CLOCK <= clock[0] <= 1.0:
             raise ValueError(f"pace must begin with a number within [{LEAST_CLOCK:g}, 1]; got {clock[0]:g}")
-        # Active traces have grown to no more than this, see ActiveTraces.reserve.
+        # ActiveTraces.reserve never allocates more than this.
         most = 4 * (n_points if rows is None else len(rows)) + 2 * n_envs * k
         checked_integer(traces, "capacity", n, max(most, SMALLEST_CAPACITY))

@@ -1,4 +1,4 @@
-"""The learning step as one compiled call over the memory of the torch tensors."""
+"""The learning step as one call of compiled code that works on the memory of the torch tensors."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ FLOAT32 = np.dtype(np.float32)
 
 class Workplace:
     """
-    The arrays that a kernel works on, as one state that follows perception and table when these change.
+    Builds and owns a kernel state, and rebuilds it when the perception or the table changes.
 
-    :param perceiver: with weights that are known to the kernels
+    :param perceiver: with weights that the kernels implement
     :param table: the Q-table, on the CPU
-    :param selection: how actions are selected
+    :param selection: arguments of action selection
     :param n_envs: number of environments
-    :param n_uniforms: random numbers that a selection takes
-    :param config: which form the update has
-    :param traces: the eligibility traces; ``None`` for those that the table has
+    :param config: variant of the update
+    :param traces: the eligibility traces; ``None`` for those of the table
     :param stream: rows of random numbers, shape (n_envs, 2, n_uniforms); ``None`` if none are needed
     """
 
@@ -78,14 +77,14 @@ class Workplace:
         self.bind()
 
     def bind(self) -> None:
-        """Take in perception and table as they are now."""
+        """Build the kernel state from the current perception and table."""
         self.versions = self.perceiver.version, self.table.version
         perception = self.perceiver.arguments
         assert perception is not None
         traces = self.traces or self.table.traces
         no_rows = RandomRows(np.empty((0, 0, 0, 0)), np.zeros(1, np.int64))
         random = no_rows if self.stream is None else RandomRows(self.stream.rows, self.stream.taken)
-        # Values that are new are not known to be small, nor traces.
+        # No bound of the new values is known.
         self.work.value_bound[0] = np.inf
         groups = (
             perception,
@@ -97,16 +96,16 @@ class Workplace:
             random,
             self.work,
         )
-        # numba cannot be interrupted while it hands a state over.
+        # numba does not support an interruption while it boxes or unboxes a state.
         with interrupts_held():
-            # The state does not keep its arrays.
+            # The state does not own its arrays: keep them alive here.
             self.state, self._lent = make_state(*groups), groups
 
     def follow(self) -> bool:
         """
-        Take in perception and table if they have changed.
+        Rebuild the kernel state if the perception or the table has changed.
 
-        :return: whether they have
+        :return: whether it was rebuilt
         """
         if self.versions == (self.perceiver.version, self.table.version):
             return False
@@ -123,14 +122,14 @@ class Workplace:
 
 class CompiledLearner(Learner):
     """
-    The same answers as :class:`~sb3_knntd.learners.reference.TorchLearner`, on the CPU, in microseconds.
+    The same results as :class:`~sb3_knntd.learners.reference.TorchLearner`, on the CPU, in microseconds.
 
-    :param perceiver: with weights that are known to the kernels
+    :param perceiver: with weights that the kernels implement
     :param table: the Q-table
     :param selector: selects actions
     :param stream: rows of random numbers, shape (n_envs, 2, selector.n_uniforms)
     :param n_envs: number of environments
-    :param config: which form the update has
+    :param config: variant of the update
     """
 
     def __init__(
@@ -166,7 +165,7 @@ class CompiledLearner(Learner):
     @property
     def actions(self) -> np.ndarray:
         episodes = self._workplace.episodes
-        # One action for all neighbours is the column that the first of them selected.
+        # All neighbours selected the same column: read that of the first one.
         if self._workplace.selection.combination == Combination.OF_VALUES:
             indices: np.ndarray = episodes.action_indices[td.CURRENT, :, 0, 0]
             return indices
@@ -219,7 +218,7 @@ class CompiledLearner(Learner):
     def _step(
         self, seen: np.ndarray, observations: np.ndarray, rewards: np.ndarray, ended: np.ndarray, rates: Rates
     ) -> None:
-        # One by one, which numba takes in a quarter of a microsecond sooner than their tuple.
+        # Pass the rates separately: numba takes a quarter of a microsecond longer to unbox a tuple.
         learning_rate, trace_decay, exploration = rates
         outcome = self._learn(seen, rewards, ended, learning_rate, trace_decay, exploration)
         while outcome != td.OK:
@@ -282,7 +281,7 @@ class CompiledLearner(Learner):
                 self._workplace.work.value_bound[0] = np.inf
 
     def _find(self, seen: np.ndarray, which: int, envs: Any = slice(None)) -> None:
-        """Find the neighbours by a search that the kernel does not have in it."""
+        """Find the neighbours with a search that the kernels do not implement."""
         neighbors = self.perceiver.find(th.from_numpy(seen))
         episodes = self._workplace.episodes
         episodes.indices[which, envs] = neighbors.indices.numpy()
@@ -314,7 +313,7 @@ class CompiledLearner(Learner):
         with self.table.lock:
             return {
                 "indices": th.from_numpy(episodes.indices[td.CURRENT].copy()),
-                # None while there are no episodes: a state without them is one that has not begun.
+                # All zeros if there are no current episodes.
                 "probabilities": th.from_numpy(episodes.probabilities[td.CURRENT] * self.in_episodes),
                 "entries": th.from_numpy(episodes.action_indices[td.CURRENT].copy()),
                 "held": th.from_numpy(episodes.persistent.copy()),
@@ -333,7 +332,7 @@ class CompiledLearner(Learner):
         episodes.action_indices[td.CURRENT] = state_dict["entries"].numpy()
         episodes.persistent[:] = state_dict["held"].numpy()
         episodes.lengths[:] = state_dict["lengths"].numpy()
-        # Added up in the order of the kernel, to the last bit.
+        # Sum in the order of the kernel, for the same rounding.
         actions = episodes.actions[td.CURRENT]
         actions[:] = 0.0
         for (env, neighbor, _), column in np.ndenumerate(episodes.action_indices[td.CURRENT]):
@@ -345,9 +344,9 @@ class CompiledLearner(Learner):
 
 class GreedyReader:
     """
-    Reads the greedy actions of single observations from a table, from any thread and while a learner works.
+    Reads the greedy actions of a few observations from a table, from any thread and also while a learner updates it.
 
-    :param perceiver: with weights that are known to the kernels
+    :param perceiver: with weights that the kernels implement
     :param table: the Q-table, on the CPU
     :param selector: selects actions
     """
@@ -361,8 +360,8 @@ class GreedyReader:
     def __call__(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         :param observations: shape (batch, obs_dim), finite, observation units
-        :return: the columns that the neighbours select, shape (batch, k, n_factors), and how much each neighbour
-            counts, shape (batch, k)
+        :return: the columns that the neighbours select, shape (batch, k, n_factors), and the probabilities of the
+            neighbours, shape (batch, k)
         """
         place = self._workplace
         perceiver, n = place.perceiver, len(observations)
@@ -383,7 +382,7 @@ class GreedyReader:
 def as_rows(observations: np.ndarray) -> np.ndarray:
     """
     :param observations: shape (batch, obs_dim), or (batch,) for Discrete, any number type
-    :return: the same, shape (batch, obs_dim), in one of two types, so that the kernels are compiled for no more
+    :return: the same, shape (batch, obs_dim), as float32 or float64, so that kernels are compiled for only two types
     """
     if observations.dtype is not FLOAT32:
         observations = observations.astype(np.float64, copy=False)

@@ -22,15 +22,15 @@ from sb3_knntd.q_table import DenseTable, DenseTraces, OneStepTraces, Traces
 
 class TorchLearner(Learner):
     """
-    The step as torch operations on any device, with traces as the equations have them.
+    The learning step as torch operations on any device, with traces as in the paper's equations.
 
     :param perceiver: finds and weighs the neighbours of an observation
     :param table: the Q-table
     :param selector: selects actions
     :param stream: rows of random numbers, shape (n_envs, 2, selector.n_uniforms)
     :param n_envs: number of environments
-    :param config: which form the update has
-    :param one_step: whether λ is 0 throughout, and no trace has to be kept
+    :param config: variant of the update
+    :param one_step: whether λ is always 0, so that no traces are stored
     """
 
     table: DenseTable
@@ -53,9 +53,9 @@ class TorchLearner(Learner):
         self.indices = th.zeros(self.shape[:2], dtype=th.int64, device=values.device)
         self.probabilities = values.new_zeros(self.shape[:2])
         self.action_indices = th.zeros(self.shape, dtype=th.int64, device=values.device)
-        #: what each environment is exploring, see :meth:`~sb3_knntd.actions.selection.ActionSelector.persist`
+        #: persistent actions, see :meth:`~sb3_knntd.actions.selection.ActionSelector.persist`
         self.persistent = th.full((n_envs, n_factors), UNDRAWN, dtype=th.int64, device=values.device)
-        #: see :func:`~sb3_knntd.kernels.selection.count_steps`; on the CPU, where it is known which episodes ended
+        #: see :func:`~sb3_knntd.kernels.selection.count_steps`; on the CPU, like ``ended``
         self.lengths = np.zeros(1 + n_envs)
         self._actions = np.empty(0)
         self._sums = values.new_zeros(2)
@@ -142,7 +142,7 @@ class TorchLearner(Learner):
         corrections = rates.learning_rate * errors
         if self.config.normalized:
             corrections = corrections / probabilities.square().sum(dim=1)
-        # On an accelerator looking would mean waiting for it.
+        # On an accelerator, this check would make the host wait.
         before = self._copy_if_large(corrections) if corrections.is_cpu else None
         traces.mark(indices, action_indices, probabilities)
         traces.credit(corrections)
@@ -152,7 +152,7 @@ class TorchLearner(Learner):
         traces.decay(self.config.gamma * rates.trace_decay, over)
 
     def _copy_if_large(self, corrections: th.Tensor) -> th.Tensor | None:
-        """The table's values, if they could become larger than is allowed. A trace is below 1e9."""
+        """A copy of the table's values, if they could exceed ``LARGEST_VALUE``. Traces are below 1e9."""
         bound = float(self.table.values.abs().max() + 1e9 * corrections.abs().sum())
         if bound <= LARGEST_VALUE:
             return None
@@ -173,7 +173,7 @@ class TorchLearner(Learner):
     def _update_from(
         self, traces: Traces, transitions: Transitions, column: th.Tensor, t: int, goes_on: bool, rates: Rates
     ) -> bool:
-        """Learn from one transition; whether the next goes on from it."""
+        """Learn from one transition; whether the next one continues it."""
         device = self.indices.device
         rows, probabilities, indices = self._rows_at(transitions.observations[t])
         next_rows, next_probabilities, _ = self._rows_at(transitions.next_observations[t])
@@ -196,7 +196,7 @@ class TorchLearner(Learner):
         return rows, perception.probabilities.to(rows.dtype), perception.indices
 
     def _follow_table(self) -> None:
-        """Have traces of as many points as the table has by now."""
+        """Make new traces if the number of points of the table has changed."""
         if self.traces.n_points != len(self.table.values):
             self.traces = self._make_traces(self.n_envs)
 
@@ -215,7 +215,7 @@ class TorchLearner(Learner):
     def state_dict(self) -> dict[str, Any]:
         return {
             "indices": self.indices.cpu(),
-            # None while there are no episodes: a state without them is one that has not begun.
+            # All zeros if there are no current episodes.
             "probabilities": self.probabilities.double().cpu() * self.in_episodes,
             "entries": self.action_indices.cpu(),
             "held": self.persistent.cpu(),
@@ -252,7 +252,7 @@ class TorchLearner(Learner):
         return Perception(perception.indices, probabilities), selection
 
     def _value(self) -> th.Tensor:
-        """Q(s, a) at the state and action that each environment is leaving, shape (n_envs,)."""
+        """Q(s, a) at the current state and action of each environment, shape (n_envs,)."""
         return self.selector.value(self.table.rows(self.indices), self.probabilities, self.action_indices)
 
     def _advance(self, perception: Perception, selection: Selection) -> None:

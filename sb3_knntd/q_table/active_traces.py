@@ -1,4 +1,4 @@
-"""The eligibility traces of the compiled learner, and the values of the entries that have one."""
+"""The eligibility traces of the compiled learner, and the values of the entries that have a trace."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import torch as th
 
 from sb3_knntd.kernels.traces import TableArrays, TraceArrays, flush, rehash
 
-#: Active points that there is room for at the start.
+#: Initial capacity, active points.
 SMALLEST_CAPACITY = 1024
 
 
 class ActiveTraces:
     """
-    Exact eligibility traces at a cost that depends on neither the table, nor λ, nor the length of the episode.
-    :mod:`sb3_knntd.kernels.traces` says how. While a point is active its values are kept here.
+    Exact eligibility traces whose cost is independent of the size of the table, λ and the length of the episode, see
+    :mod:`sb3_knntd.kernels.traces`. While a point is active, its values are stored here.
 
     :param n_actions: number of columns of the table
     :param n_envs: number of environments
-    :param capacity: number of points that there is room for
+    :param capacity: initial capacity, active points
     """
 
-    #: replaced as a whole, so that an interruption leaves all arrays as they were
+    #: replaced as a whole, so that an interruption leaves all arrays unchanged
     arrays: TraceArrays
 
     def __init__(self, n_actions: int, n_envs: int, capacity: int = SMALLEST_CAPACITY) -> None:
@@ -49,15 +49,15 @@ class ActiveTraces:
 
     @property
     def capacity(self) -> int:
-        """Number of points that there is room for."""
+        """Number of points that the arrays can hold."""
         return len(self.arrays.active_points)
 
     def reserve(self, n_points: int, table: TableArrays) -> bool:
         """
-        Make room, first by dropping the points whose traces have decayed.
+        Reserve capacity. Points whose traces have decayed are dropped first.
 
-        :param n_points: how many points may become active in the next step
-        :param table: where the values of dropped points are written
+        :param n_points: largest number of points that may become active in the next step
+        :param table: the table that the values of dropped points are written to
         :return: whether the arrays have been replaced
         """
         if self.capacity - self.count >= n_points:
@@ -70,12 +70,12 @@ class ActiveTraces:
         return True
 
     def clear(self) -> None:
-        """Drop all traces, and the values of the entries that had one."""
+        """Drop all traces, and the values of the entries with a trace."""
         self.arrays = self._empty(SMALLEST_CAPACITY)
 
     def state(self) -> dict[str, Any]:
         """
-        :return: tensors and numbers from which :meth:`set_state` goes on to the same bit
+        :return: tensors and numbers from which :meth:`set_state` restores the traces exactly
         """
         n, n_envs, arrays = self.count, self.n_envs, self.arrays
         entries = th.from_numpy(arrays.active_entries[:n].copy())
@@ -90,7 +90,7 @@ class ActiveTraces:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """
-        :param state: what :meth:`state` returned, for as many environments
+        :param state: the return value of :meth:`state`, for the same number of environments
         """
         self.arrays = self._made_of(state, state["capacity"])
 
@@ -108,7 +108,7 @@ class ActiveTraces:
 
 def make_slots(capacity: int) -> np.ndarray:
     """
-    :param capacity: how many points a hash is to hold
-    :return: an empty hash, at most half full then, see :mod:`sb3_knntd.kernels.traces`
+    :param capacity: number of points that the hash must hold
+    :return: an empty hash, at most half full with that many points, see :mod:`sb3_knntd.kernels.traces`
     """
     return np.full((1 << max(2 * capacity - 1, 1).bit_length(), 2), -1, np.int64)

@@ -1,4 +1,4 @@
-"""The Q-table: one row a perception point, one column an action."""
+"""The Q-table: a row for each perception point, a column for each action."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels.traces import TableArrays, read_rows, rehash, write_back
 from sb3_knntd.q_table.active_traces import ActiveTraces, make_slots
 
-#: Points whose values are carried over at a time.
+#: Number of points whose values are carried over at a time.
 BATCH = 2**16
 
 
 class Regridding(Protocol):
-    """From the points where they were to where they are, see :class:`~sb3_knntd.perception.perceiver.Regridding`."""
+    """A map between the old and the new points, see :class:`~sb3_knntd.perception.perceiver.Regridding`."""
 
     def sources(self, indices: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """The points that points as they are were nearest to, and how much each of these counts."""
+        """The nearest old points of each new point, and their weights."""
 
     def targets(self, indices: th.Tensor) -> th.Tensor:
-        """The point that is now nearest to each point as it was."""
+        """The nearest new point of each old point."""
 
 
 class QTable(nn.Module, ABC):
     """
-    What every table does.
+    Base class of Q-tables.
 
-    Its entries can be read from any thread at any time, also while a learner works: both hold :attr:`lock`. Values of
-    the points that have an eligibility trace are kept in :attr:`traces` until the trace has decayed, and everything
-    that reads the table here takes them from there.
+    Entries can be read from any thread at any time, also while a learner updates them: both hold :attr:`lock`. The
+    values of points with an eligibility trace are stored in :attr:`traces` until the trace has decayed; all methods
+    that read the table read them from there.
 
     :param n_actions: number of columns
-    :param initial_value: what every entry is at the start
+    :param initial_value: initial value of all entries
     """
 
     values: th.Tensor
@@ -47,14 +47,14 @@ class QTable(nn.Module, ABC):
         super().__init__()
         self.n_actions = n_actions
         self.initial_value = float(initial_value)
-        #: to be held while entries are read or written
+        #: hold this lock while entries are read or written
         self.lock = threading.RLock()
-        #: raised whenever arrays have been replaced, or other values given to them
+        #: incremented whenever arrays have been replaced or set to other values
         self.version = 0
         self.traces = ActiveTraces(n_actions, n_envs=1, capacity=0)
 
     def __getstate__(self) -> dict[str, Any]:
-        # A lock belongs to one table in one process.
+        # A lock cannot be copied or pickled.
         return {name: value for name, value in self.__dict__.items() if name != "lock"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -64,14 +64,14 @@ class QTable(nn.Module, ABC):
     @property
     @abstractmethod
     def n_visited(self) -> int:
-        """Number of points that have been learned at."""
+        """Number of points that have been updated by learning."""
 
     def start_traces(self, n_envs: int) -> ActiveTraces:
         """
-        Drop all traces, and begin to keep those of so many environments.
+        Drop all traces, and start new ones.
 
         :param n_envs: number of environments
-        :return: the traces, which this table reads from then on
+        :return: the new traces, which this table reads from now on
         """
         with self.lock:
             self._write_back()
@@ -80,15 +80,15 @@ class QTable(nn.Module, ABC):
             return self.traces
 
     def drop_traces(self) -> None:
-        """Drop all traces; the entries keep the values that they have."""
+        """Drop all traces; the entries keep their current values."""
         with self.lock:
             self._write_back()
             self.forget_traces()
 
     def train(self, mode: bool = True) -> QTable:
         """
-        As in torch. It brings :attr:`values` up to date besides: to be exported with its values, a policy is put in
-        evaluation mode first.
+        Set training or evaluation mode, as in torch, and bring :attr:`values` up to date. Before exporting a policy,
+        call ``eval()``.
 
         :param mode: whether to train
         :return: the table
@@ -97,26 +97,26 @@ class QTable(nn.Module, ABC):
         return super().train(mode)
 
     def _write_back(self) -> None:
-        """Bring ``values`` up to date. A learner does not look at what this writes before it writes there itself."""
+        """Bring ``values`` up to date. A learner does not read the entries written here before it overwrites them."""
         if self.traces.count:
             with self.lock:
                 write_back(self.arrays(), self.traces.arrays)
 
     def forget_traces(self) -> None:
-        """Drop all traces and the values of the entries that had one."""
+        """Drop all traces and the values of the entries with a trace."""
         self.traces.clear()
         self.version += 1
 
     @abstractmethod
     def entries(self) -> th.Tensor:
         """
-        :return: the rows there are, up to date, shape (n_rows, n_actions)
+        :return: all rows, up to date, shape (n_rows, n_actions)
         """
 
     @abstractmethod
     def points(self) -> th.Tensor | None:
         """
-        :return: the point of each row, shape (n_rows,), int64; ``None`` if the points are the rows
+        :return: the point of each row, shape (n_rows,), int64; ``None`` if row i is that of point i
         """
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
@@ -131,30 +131,30 @@ class QTable(nn.Module, ABC):
 
     def reserve(self, n_points: int) -> None:
         """
-        Make room.
+        Reserve capacity for the next step.
 
-        :param n_points: how many points the next step may come upon
+        :param n_points: largest number of new points in the next step
         """
         self.make_room(self.traces, n_points)
 
     def make_room(self, traces: ActiveTraces, n_points: int) -> None:
         """
-        Make room in the table and in traces of it.
+        Reserve capacity in the table and in traces.
 
-        :param traces: this table's, or others
-        :param n_points: how many points the next step may come upon
+        :param traces: :attr:`traces`, or other traces of this table
+        :param n_points: largest number of new points in the next step
         """
         if self._reserve_rows(n_points) | traces.reserve(n_points, self.arrays()):
             self.version += 1
 
     @abstractmethod
     def _reserve_rows(self, n_points: int) -> bool:
-        """Make room for the rows of so many points; whether arrays have been replaced."""
+        """Reserve rows for new points; whether arrays have been replaced."""
 
     @abstractmethod
     def add_rows(self, values: th.Tensor) -> None:
         """
-        Take in new points, numbered from the last one on.
+        Append the rows of new points.
 
         :param values: their values, shape (n_new, n_actions)
         """
@@ -162,20 +162,20 @@ class QTable(nn.Module, ABC):
     @abstractmethod
     def arrays(self) -> TableArrays:
         """
-        :return: what the kernels work on, sharing memory with this table
+        :return: the arrays for the kernels, which share memory with this table
         """
 
     @abstractmethod
     def carry_over(self, regridding: Regridding) -> None:
         """
-        Give each point the values that the table had where the point now is. All traces are dropped.
+        Set each point to the value that the table had at the point's new position. All traces are dropped.
 
-        :param regridding: where the points were, and where they are
+        :param regridding: map between the old and the new points
         """
 
     @staticmethod
     def _carried(values: th.Tensor, sources: tuple[th.Tensor, th.Tensor]) -> th.Tensor:
-        """The mean of the rows at ``sources``, rows of shape (n, k, n_actions), shape (n, n_actions)."""
+        """The weighted mean over k rows ``values``, shape (n, k, n_actions), at ``sources``; shape (n, n_actions)."""
         return (sources[1][..., None].to(values.dtype) * values).sum(dim=1)
 
     def _apply(self, fn: Any, recurse: bool = True) -> QTable:
@@ -187,11 +187,11 @@ class QTable(nn.Module, ABC):
 
 class DenseTable(QTable):
     """
-    A row for every point.
+    A table with a row for every point.
 
     :param n_points: number of rows
     :param n_actions: number of columns
-    :param initial_value: what every entry is at the start
+    :param initial_value: initial value of all entries
     :param dtype: floating type of the entries
     """
 
@@ -204,7 +204,7 @@ class DenseTable(QTable):
 
     @staticmethod
     def _no_visits(n_points: int) -> th.Tensor:
-        """Which rows have been learned at, a bit each, and one byte more than there are rows for."""
+        """A bit for each row: whether it has been updated by learning; and one spare byte at the end."""
         return th.zeros((n_points + 7) // 8 + 1, dtype=th.uint8)
 
     @property
@@ -213,9 +213,9 @@ class DenseTable(QTable):
 
     def visit(self, indices: th.Tensor) -> None:
         """
-        Note that points are learned at.
+        Mark points as visited.
 
-        :param indices: points, any shape, int64
+        :param indices: point indices, any shape, int64
         """
         self._visit(self.visited, indices)
 
@@ -223,7 +223,7 @@ class DenseTable(QTable):
     def _visit(visited: th.Tensor, indices: th.Tensor) -> None:
         byte, bit = indices.reshape(-1) >> 3, indices.reshape(-1) & 7
         for each in range(8):
-            # All that write to a byte at once write the same; points of another bit write to the byte to spare.
+            # Concurrent writes to a byte write the same value; points with another bit write to the spare byte.
             at = th.where(bit == each, byte, len(visited) - 1)
             visited[at] = visited[at] | (1 << each)
 
@@ -267,7 +267,7 @@ class DenseTable(QTable):
 
     def resize(self, n_points: int) -> None:
         """
-        Have rows for so many points. Where that is another number, all begin anew with the initial value.
+        Change the number of rows. If it changes, all entries are set to the initial value.
 
         :param n_points: number of rows
         """
@@ -278,7 +278,7 @@ class DenseTable(QTable):
                 self.visited = self._no_visits(n_points).to(self.values.device)
 
     def _visits(self) -> th.Tensor:
-        """Which rows have been learned at, shape (n_points,), bool."""
+        """Whether each row has been updated by learning, shape (n_points,), bool."""
         bits = th.arange(8, device=self.visited.device, dtype=th.uint8)
         return ((self.visited[:-1, None] >> bits) & 1).bool().flatten()[: len(self.values)]
 
@@ -299,7 +299,7 @@ class DenseTable(QTable):
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         with self.lock:
-            # What is missing or has another shape torch tells of.
+            # Missing tensors and wrong shapes are reported by torch.
             if prefix + "values" in state_dict:
                 checked_tensor(state_dict, prefix + "values", (None, None))
             self.forget_traces()
@@ -312,7 +312,7 @@ class _Rows(NamedTuple):
 
     :param values: shape (capacity, n_actions)
     :param points: the point of each row, shape (capacity,), int64
-    :param slots: hash of the rows by point
+    :param slots: hash from points to rows
     :param n_used: number of rows in use, shape (1,), int64
     """
 
@@ -324,12 +324,12 @@ class _Rows(NamedTuple):
 
 class HashedTable(QTable):
     """
-    A row for every point that has been learned at; all others are worth the initial value. For lattices larger than
-    memory. On the CPU only.
+    A table with a row for every visited point; all other points have the initial value. For lattices larger than
+    memory, on the CPU only.
 
-    :param n_points: number of points that may get a row
+    :param n_points: number of points of the lattice
     :param n_actions: number of columns
-    :param initial_value: what every entry is at the start
+    :param initial_value: initial value of all entries
     :param dtype: floating type of the entries
     """
 
@@ -339,11 +339,11 @@ class HashedTable(QTable):
         super().__init__(n_actions, initial_value)
         self.n_points = n_points
         no_points, no_values = th.empty(0, dtype=th.int64), th.empty((0, n_actions), dtype=dtype)
-        # Replaced as a whole, so that an interruption leaves all rows as they were.
+        # Replaced as a whole, so that an interruption leaves all rows unchanged.
         self._rows = self._made_of(no_points, no_values, self.SMALLEST)
 
     def _made_of(self, points: th.Tensor, values: th.Tensor, capacity: int) -> _Rows:
-        """These rows, and room for more."""
+        """Allocate ``capacity`` rows and fill the first ones."""
         n = len(points)
         rows = _Rows(
             th.full((capacity, self.n_actions), self.initial_value, dtype=values.dtype),
@@ -358,7 +358,7 @@ class HashedTable(QTable):
 
     @property
     def values(self) -> th.Tensor:  # type: ignore[override]
-        """The rows, and those that there is room for, shape (capacity, n_actions)."""
+        """The rows in use, followed by unused ones, shape (capacity, n_actions)."""
         return self._rows.values
 
     @property
@@ -378,7 +378,7 @@ class HashedTable(QTable):
             raise ValueError(
                 "a policy with a hashed table cannot be traced or exported: its rows are found by compiled code. Make "
                 "the model with policy_kwargs={'table': 'dense'}, and fewer points if it would not fit; predict works "
-                "with any"
+                "with every table"
             )
         return super().rows(indices)
 
@@ -411,7 +411,7 @@ class HashedTable(QTable):
         )
 
     def _refill(self, points: th.Tensor, values: th.Tensor) -> None:
-        """Have these rows and no others."""
+        """Replace all rows by these."""
         rows = self._made_of(points, values, max(self.SMALLEST, len(points)))
         self.forget_traces()
         self._rows = rows

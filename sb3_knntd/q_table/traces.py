@@ -1,4 +1,4 @@
-"""Eligibility traces as the equations have them: the reference that faster forms are held to."""
+"""Eligibility traces as in the paper's equations: the reference for the faster implementations."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from sb3_knntd.q_table.table import DenseTable
 
 class Traces(ABC):
     """
-    What the torch step asks of traces, on any device.
+    Eligibility traces of the torch learner, on any device.
 
-    Environments share the table and keep their own traces. Where those of several meet at an entry, it
-    moves by the mean of their TD errors, weighted by eligibility, times the largest eligibility: many
-    environments in the same place do not multiply the step, and one environment alone has eq. 14.
+    The environments share the table, and each has its own traces. If several have a trace at the same entry, it changes
+    by the mean of their TD errors, weighted by eligibility, times the largest eligibility. So the step size does not
+    grow with the number of environments in the same place. With one environment this is eq. 14.
     """
 
-    #: number of points of the table that they are for
+    #: number of points of the table
     n_points: int
 
     @abstractmethod
-    def mark(self, indices: th.Tensor, entries: th.Tensor, probabilities: th.Tensor) -> None:
+    def mark(self, indices: th.Tensor, action_indices: th.Tensor, probabilities: th.Tensor) -> None:
         """
-        Set the traces of the state each environment is in.
+        Set the traces of the current state of each environment.
 
-        :param indices: points, shape (n_envs, k)
-        :param entries: the columns of each, shape (n_envs, k, n_factors)
-        :param probabilities: what to set, shape (n_envs, k), the table's dtype
+        :param indices: neighbours, shape (n_envs, k), int64
+        :param action_indices: columns that each neighbour selected, shape (n_envs, k, n_factors), int64
+        :param probabilities: of the neighbours, shape (n_envs, k), the table's dtype
         """
 
     @abstractmethod
@@ -43,7 +43,7 @@ class Traces(ABC):
     @abstractmethod
     def decay(self, factor: float, ended: th.Tensor) -> None:
         """
-        e *= γ λ (eq. 17), and no trace outlives its episode.
+        e *= γ λ (eq. 17), and e = 0 in episodes that have ended.
 
         :param factor: γ λ
         :param ended: whether each environment's episode has ended, shape (n_envs,), bool
@@ -51,26 +51,27 @@ class Traces(ABC):
 
     @abstractmethod
     def clear(self) -> None:
-        """Let go all traces."""
+        """Drop all traces."""
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
         """
-        :return: the traces that are not zero, in the form of :class:`~sb3_knntd.q_table.ActiveTraces`
+        :return: the nonzero traces, in the format of :class:`~sb3_knntd.q_table.ActiveTraces`
         """
 
     @abstractmethod
     def set_state(self, state: dict[str, Any]) -> None:
         """
-        :param state: of these traces or of a :class:`~sb3_knntd.q_table.ActiveTraces`, for as many environments
+        :param state: the state of such traces or of a :class:`~sb3_knntd.q_table.ActiveTraces`, for the same number of
+            environments
         """
 
 
 class DenseTraces(Traces):
     """
-    One number for every environment and entry, all of them touched at every step.
+    One number for each environment and entry of the table. Each step updates all of them.
 
-    :param table: the table that the traces are for
+    :param table: the Q-table
     :param n_envs: number of environments
     :param kind: ``"replacing"`` (eq. 16) or ``"accumulating"`` (eq. 15)
     :param reset_other_actions: whether a replacing trace clears those of the other actions at its points
@@ -85,14 +86,14 @@ class DenseTraces(Traces):
         self.eligibility = table.values.new_zeros((n_envs, *table.values.shape))
         self._envs = th.arange(n_envs, device=table.values.device)[:, None]
 
-    def mark(self, indices: th.Tensor, entries: th.Tensor, probabilities: th.Tensor) -> None:
-        marked = (self._envs[..., None], indices[..., None], entries)
+    def mark(self, indices: th.Tensor, action_indices: th.Tensor, probabilities: th.Tensor) -> None:
+        marked = (self._envs[..., None], indices[..., None], action_indices)
         if self.kind == "accumulating":
             self.eligibility[marked] += probabilities[..., None]
             return
         if self.reset_other_actions:
             self.eligibility[self._envs, indices] = 0.0
-        self.eligibility[marked] = probabilities[..., None].expand(entries.shape)
+        self.eligibility[marked] = probabilities[..., None].expand(action_indices.shape)
 
     def credit(self, corrections: th.Tensor) -> None:
         total = th.tensordot(corrections, self.eligibility, dims=1)
@@ -102,7 +103,7 @@ class DenseTraces(Traces):
         self.table.values += total
 
     def decay(self, factor: float, ended: th.Tensor) -> None:
-        # A product, as indexing by a mask would have the host wait for an accelerator.
+        # A product: indexing by a mask would make the host wait for an accelerator.
         self.eligibility *= factor * (~ended).to(self.eligibility.dtype)[:, None, None]
 
     def clear(self) -> None:
@@ -129,10 +130,10 @@ class DenseTraces(Traces):
 
 class OneStepTraces(Traces):
     """
-    Traces for λ = 0: a trace lasts for the step that sets it, so that a step costs O(n_envs · k) and no table of
-    traces is held. On an accelerator sums over environments have no fixed order, and the last digit may vary.
+    Traces for λ = 0. A trace lasts only for the step that sets it, so a step costs O(n_envs · k) and needs no table of
+    traces. On an accelerator, sums over environments have no fixed order, and the last digit may vary.
 
-    :param table: the table that the traces are for
+    :param table: the Q-table
     :param n_envs: number of environments
     """
 
@@ -143,9 +144,9 @@ class OneStepTraces(Traces):
         self._n_actions = table.n_actions
         self._together, self._largest = self._values.new_zeros((2, len(self._values) if n_envs > 1 else 0))
 
-    def mark(self, indices: th.Tensor, entries: th.Tensor, probabilities: th.Tensor) -> None:
-        self._marked = (indices[..., None] * self._n_actions + entries).view(-1)
-        self._eligibility = probabilities[..., None].expand(entries.shape).reshape(-1)
+    def mark(self, indices: th.Tensor, action_indices: th.Tensor, probabilities: th.Tensor) -> None:
+        self._marked = (indices[..., None] * self._n_actions + action_indices).view(-1)
+        self._eligibility = probabilities[..., None].expand(action_indices.shape).reshape(-1)
 
     def credit(self, corrections: th.Tensor) -> None:
         moves = self._eligibility * corrections.repeat_interleave(
@@ -160,10 +161,10 @@ class OneStepTraces(Traces):
         self._values.index_add_(0, self._marked, moves)
 
     def decay(self, factor: float, ended: th.Tensor) -> None:
-        """Nothing to do: none is left."""
+        """Do nothing: no trace outlasts its step."""
 
     def clear(self) -> None:
-        """Nothing to do: none is kept."""
+        """Do nothing: no trace is stored between steps."""
 
     def state(self) -> dict[str, Any]:
         return {
@@ -176,4 +177,4 @@ class OneStepTraces(Traces):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Nothing to do: a trace of λ = 0 is over when a state is saved."""
+        """Do nothing: with λ = 0 there are no traces when a state is saved."""
