@@ -1,26 +1,20 @@
-"""Base class of KNNTD and ExA: parameters, spaces, the learner, saving and loading."""
+"""Base class of KNNTD and ExA: parameters, policy and learner, and the range of unbounded dimensions."""
 
 from __future__ import annotations
 
-import io
-import pathlib
-import pickle
 import warnings
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import is_json_serializable
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule, get_device
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.checks import (
@@ -33,30 +27,28 @@ from sb3_knntd.common.checks import (
     check_word,
     shown,
 )
-from sb3_knntd.common.files import read_description, replacing
+from sb3_knntd.common.devices import check_device
+from sb3_knntd.common.environments import check_environment, check_observation_space, normalizes_observations
 from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
-from sb3_knntd.common.plain import encodable, objects_for
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.schedules import check_rate, make_schedule
 from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.learners import CompiledLearner, Learner, Rates, TorchLearner
-from sb3_knntd.online_algorithm import OnlineAlgorithm
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.q_table import DenseTable
-
-SelfKNNAlgorithm = TypeVar("SelfKNNAlgorithm", bound="KNNAlgorithm")
+from sb3_knntd.saving import SavedAlgorithm
 
 NONE_TRUNCATED: dict[int, np.ndarray] = {}
 #: The largest seed of NumPy's global generator.
 LARGEST_SEED = 2**32 - 1
 
 
-class KNNAlgorithm(OnlineAlgorithm):
+class KNNAlgorithm(SavedAlgorithm):
     """
-    Base class of the algorithms of this package: parameters, spaces, the learner, saving and loading.
+    Base class of the algorithms of this package: parameters, policy, learner, and measuring of unbounded dimensions.
 
     The parameters are those of :class:`~sb3_knntd.KNNTD`.
     """
@@ -84,8 +76,6 @@ class KNNAlgorithm(OnlineAlgorithm):
     initial_value: Any = FixedHyperparameter()
 
     _is_set_up = False
-    #: Name of the algorithm in saved files, the same for all subclasses, which can load each other's files.
-    _algorithm: ClassVar[str]
     #: Type of the supported action spaces, and advice for unsupported ones.
     _supported_action_space: ClassVar[type[spaces.Space[Any]]]
     _action_space_advice: ClassVar[str]
@@ -182,8 +172,8 @@ class KNNAlgorithm(OnlineAlgorithm):
         name = next(iter(cls.policy_aliases))
         default: type[KNNPolicy] = cls.policy_aliases[name]  # type: ignore[assignment]
         call = f'{cls.__name__}(env), or in SB3\'s order {cls.__name__}("{name}", env)'
-        cls._check_environment(policy)
-        cls._check_environment(env)
+        check_environment(cls.__name__, policy)
+        check_environment(cls.__name__, env)
         if isinstance(policy, str) and policy in cls.policy_aliases:
             policy = cls.policy_aliases[policy]
         if isinstance(policy, str) and policy.endswith("Policy"):
@@ -203,40 +193,8 @@ class KNNAlgorithm(OnlineAlgorithm):
         return default, policy
 
     @classmethod
-    def _check_environment(cls, given: Any) -> None:
-        """Refuse classes of environments, and environments of gymnasium.vector."""
-        if isinstance(given, type) and issubclass(given, (gym.Env, gym.vector.VectorEnv, VecEnv)):
-            raise ValueError(
-                f"env must be an environment; got the class {given.__name__}. Make an instance: "
-                f"{cls.__name__}({given.__name__}(...))"
-            )
-        if isinstance(given, gym.vector.VectorEnv):
-            raise ValueError(
-                f"{cls.__name__} takes SB3's VecEnv, not environments of gymnasium.vector; got {given!r}. Instead of "
-                "gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
-            )
-
-    @classmethod
     def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
-        discrete = isinstance(observation_space, spaces.Discrete) or (
-            isinstance(observation_space, spaces.MultiDiscrete | spaces.MultiBinary)
-            and len(observation_space.shape or ()) == 1
-        )
-        vector = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 1
-        if not (discrete or (vector and observation_space.shape != (0,))):
-            if isinstance(observation_space, spaces.Dict | spaces.Tuple):
-                advice = "Flatten it with gymnasium.wrappers.FlattenObservation"
-            elif isinstance(observation_space, spaces.Box) and len(observation_space.shape) >= 2:
-                advice = (
-                    "Images have too many dimensions for a table of points: extract a few features first, or use a "
-                    "network (DQN, PPO); small arrays can be flattened with gymnasium.wrappers.FlattenObservation"
-                )
-            else:
-                advice = "Map it to a Box of shape (n,) with gymnasium.wrappers.TransformObservation"
-            raise ValueError(
-                f"{cls.__name__} takes observations in a Box of shape (n,), Discrete, or MultiDiscrete or MultiBinary "
-                f"of one axis; got {observation_space}. {advice}"
-            )
+        check_observation_space(cls.__name__, observation_space)
         if not isinstance(action_space, cls._supported_action_space):
             raise ValueError(
                 f"{cls.__name__} takes actions in a {cls._supported_action_space.__name__} space; got {action_space}. "
@@ -348,7 +306,7 @@ class KNNAlgorithm(OnlineAlgorithm):
         :raises ValueError: if it is a class or an environment of gymnasium.vector; if only one of this environment and
             the one that the model was made with normalises observations (VecNormalize); as in SB3, if its spaces differ
         """
-        self._check_environment(env)
+        check_environment(type(self).__name__, env)
         self._check_normalization(env)
         super().set_env(env, force_reset)
 
@@ -525,148 +483,3 @@ class KNNAlgorithm(OnlineAlgorithm):
             "train/exploration_rate": self.exploration_rate,
             "train/visited_points": self.policy.table.n_visited,
         }
-
-    # ------------------------------------------------------ saving and loading
-
-    def _excluded_save_params(self) -> list[str]:
-        ours = ["_stream", "_prediction_stream", "_is_set_up"]
-        return [*super()._excluded_save_params(), *ours]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "learner"], []
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        Save the complete state to a zip file: table, traces, random state and counters. The file is written atomically:
-        an interruption leaves the old file.
-
-        :param path: file, with ``.zip`` added if it has no suffix, or file-like object
-        :param exclude: attributes to exclude in addition to SB3's
-        :param include: attributes to save although SB3 excludes them
-        """
-        self._stream_states = [self._stream.state(), self._prediction_stream.state()]
-        shown, in_episodes = self._last_obs, self.learner.in_episodes
-        if self._acted_on is not None:
-            # Called by a callback: the saved model must continue with the next step.
-            self._move_on()
-        try:
-            if not isinstance(path, (str, pathlib.Path)):
-                self._save(path, exclude, include)
-                return
-            target = pathlib.Path(path)
-            if not target.suffix:
-                target = target.with_name(f"{target.name}.zip")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with replacing(target) as file:
-                self._save(file, exclude, include)
-        finally:
-            self._last_obs, self.learner.in_episodes = shown, in_episodes
-
-    def _save(self, file: Any, exclude: Iterable[str] | None, include: Iterable[str] | None) -> None:
-        """Save to an open file, and add the pickled objects as data, for :meth:`load` with ``trusted=False``."""
-        left_out = {*self._excluded_save_params(), *(exclude or ())} - set(include or ())
-        values = {name: value for name, value in vars(self).items() if name not in left_out}
-        self.plain = encodable({name: value for name, value in values.items() if not is_json_serializable(value)})
-        try:
-            super().save(file, exclude, include)
-        finally:
-            del self.plain
-
-    @classmethod
-    def load(
-        cls: type[SelfKNNAlgorithm],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: th.device | str = "cpu",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        trusted: bool = True,
-        **kwargs: Any,
-    ) -> SelfKNNAlgorithm:
-        """
-        Load a model from a zip file.
-
-        SB3's format contains pickled objects, and unpickling executes code from the file, so load only files from
-        sources that you trust. With ``trusted=False`` nothing is unpickled: spaces, SB3's schedules, arrays and numbers
-        are read from the data that :meth:`save` adds to the file.
-
-        :param path: file, or file-like object
-        :param env: environment to continue with, ``None`` to predict only. The number of environments may differ from
-            the saved one
-        :param device: device of the perception and the table
-        :param custom_objects: objects that replace those in the file
-        :param print_system_info: whether to print information on the system that the model was saved on
-        :param force_reset: whether ``learn`` starts new episodes; with ``False`` it continues the saved episodes, for
-            an environment that is still in the saved state
-        :param trusted: whether to unpickle objects; use ``False`` for files from others
-        :param kwargs: attributes to change; with ``seed``, new sequences of random numbers are started
-        :return: the model
-        :raises ValueError: if the file is damaged, the algorithm or the spaces of ``env`` differ, or, with
-            ``trusted=False``, the file holds functions or other objects only as pickles
-        """
-        cls._check_environment(env)
-        saved = read_description(path)
-        if saved.get("algorithm") != cls._algorithm:
-            raise ValueError(
-                f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls._algorithm}: "
-                "load it with its own class"
-            )
-        if not trusted:
-            custom_objects = objects_for(path, saved, custom_objects or {}) | (custom_objects or {})
-        try:
-            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except (RuntimeError, pickle.UnpicklingError, KeyError) as error:  # the state does not fit
-            # SB3 handles a ValueError as if from an old file of DQN, and then raises KeyError for a missing optimizer.
-            cause = error.__context__ if isinstance(error, KeyError) and error.__context__ else error
-            raise ValueError(f"{path}: {cause}") from cause
-        vars(model).pop("plain", None)
-        # Files of the first version store the next actions here, or None if new episodes were to start.
-        if vars(model).pop("_last_actions", ...) is None:
-            model.learner.abandon_episodes()
-        if env is not None:
-            model._check_normalization(model.env)
-        if model.n_envs != saved["n_envs"]:
-            model._last_obs = None
-        elif model._last_obs is not None:
-            shape = (model.n_envs, *(model.observation_space.shape or ()))
-            if getattr(model._last_obs, "shape", None) != shape:
-                raise ValueError(f"{path}: the last observations must have shape {shape}; got {model._last_obs!r:.200}")
-        # A given seed starts new sequences; otherwise the saved ones continue.
-        if kwargs.get("seed") is None:
-            for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
-                stream.set_state(state)
-        return model
-
-
-def normalizes_observations(env: GymEnv | None) -> bool:
-    """
-    :param env: an environment, VecEnv or not
-    :return: whether it is wrapped in a VecNormalize that normalises observations
-    """
-    normalizer = unwrap_vec_normalize(env)  # type: ignore[arg-type]
-    return normalizer is not None and normalizer.norm_obs
-
-
-def check_device(device: Any) -> th.device:
-    """
-    :param device: the given value
-    :return: the device; as in SB3, the CPU if CUDA is not available
-    :raises ValueError: if there is no such device, or it does not support float64
-    """
-    error: Exception | None = None
-    if isinstance(device, (str, th.device)):
-        try:
-            found = get_device(device)
-            # Some devices do not support float64, and some cannot store tensors at all.
-            th.zeros(1, dtype=th.float64, device=found).item()
-        except (AssertionError, RuntimeError, TypeError, ValueError) as raised:
-            error = raised
-        else:
-            return found
-    raise ValueError(f"device must be 'cpu', 'cuda', 'auto' or another of torch's; got {shown(device)}") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import pathlib
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -23,6 +24,8 @@ from sb3_knntd import KNNTD, ExA
 
 # All operations are tiny: more threads only slow the tests down, especially under pytest-xdist.
 th.set_num_threads(1)
+# A background job of a shell ignores Ctrl-C, and so would every process that a test starts and interrupts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="session")

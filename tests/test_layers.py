@@ -20,7 +20,7 @@ LAYERS = (
     ("perception", "q_table"),
     ("actions",),
     ("learners", "filters"),
-    ("policies",),
+    ("policies", "saving"),
     ("base",),
     ("knntd", "exa"),
     ("plots",),
