@@ -15,7 +15,7 @@ from sb3_knntd.actions.exploration import EpsilonGreedy
 from sb3_knntd.actions.selection import MeanValueSelector
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.kernels.selection import Target
-from sb3_knntd.learners import Rates, TorchLearner, UpdateConfig
+from sb3_knntd.learners import TorchLearner, UpdateConfig
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.q_table import DenseTable
 
@@ -68,7 +68,7 @@ def against_copy(repeats: int) -> list[Row]:
 
     distances = 2 * N_ENVS * POINTS**2 * 8
     rows = 3 * N_ENVS * K * 3 * 8
-    answers = rng.random(N_ENVS), np.zeros(N_ENVS, bool), {}, Rates(0.1, 0.0, 0.1)
+    answers = rng.random(N_ENVS), np.zeros(N_ENVS, bool), {}, (0.1, 0.0, 0.1)
     reached = {
         f"perception of {N_ENVS} observations among 10^6 points, device='cuda'": bandwidth(
             lambda: policy.perceiver(on_device), distances, repeats

@@ -31,7 +31,7 @@ from sb3_knntd.common.devices import check_device
 from sb3_knntd.common.environments import check_environment, check_observation_space, normalizes_observations
 from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.common.random_stream import RandomStream
-from sb3_knntd.common.schedules import check_rate, make_schedule
+from sb3_knntd.common.schedules import check_rate, constant_of, make_schedule
 from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
@@ -76,6 +76,8 @@ class KNNAlgorithm(SavedAlgorithm):
     initial_value: Any = FixedHyperparameter()
 
     _is_set_up = False
+    #: a schedule, and its value if that is constant
+    _constant_trace: tuple[Any, float | None] = (None, None)
     #: Type of the supported action spaces, and advice for unsupported ones.
     _supported_action_space: ClassVar[type[spaces.Space[Any]]]
     _action_space_advice: ClassVar[str]
@@ -405,13 +407,13 @@ class KNNAlgorithm(SavedAlgorithm):
         learner = self.learner
         if not learner.in_episodes:
             assert isinstance(self._last_obs, np.ndarray)
-            learner.begin(self._last_obs, self._rates().exploration)
+            learner.begin(self._last_obs, self._rates()[2])
         return self.policy.fit_actions(learner.actions)
 
     def _learn_from(
         self, new_obs: np.ndarray, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
     ) -> None:
-        truncated = self._truncated(dones, infos) if dones.any() else NONE_TRUNCATED
+        truncated = self._truncated(dones, infos) if True in dones.tolist() else NONE_TRUNCATED
         if self._measuring:
             self._measure(new_obs, rewards, truncated)
             return
@@ -425,7 +427,13 @@ class KNNAlgorithm(SavedAlgorithm):
     def _rates(self) -> Rates:
         progress = self._current_progress_remaining
         self.exploration_rate = exploration = self.exploration_schedule(progress)
-        return Rates(self.lr_schedule(progress), self.trace_schedule(progress), exploration)
+        if self.trace_schedule is not self._constant_trace[0]:
+            self._constant_trace = self.trace_schedule, constant_of(self.trace_schedule)
+        # λ hardly ever changes, and a call is noticeable in steps this short.
+        trace_decay = self._constant_trace[1]
+        if trace_decay is None:
+            trace_decay = self.trace_schedule(progress)
+        return self.lr_schedule(progress), trace_decay, exploration
 
     def _truncated(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> dict[int, np.ndarray]:
         """The last observations of truncated episodes, by environment. Those of all ended episodes are checked."""

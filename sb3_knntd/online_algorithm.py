@@ -159,9 +159,15 @@ class OnlineAlgorithm(BaseAlgorithm):
         self._standing = new_obs
         ended = dones.tolist()
         any_ended = True in ended
-        n_logs = self._count_episodes(ended, infos, dones, log_interval) if any_ended else 0
-        if not any_ended and any("episode" in info for info in infos):
-            self._update_info_buffer(infos, dones)
+        n_logs = 0
+        if any_ended:
+            n_logs = self._count_episodes(ended, infos, dones, log_interval)
+        else:
+            # A loop: a generator would take longer than all of it.
+            for info in infos:
+                if "episode" in info:
+                    self._update_info_buffer(infos, dones)
+                    break
 
         # Observations are not copied: SB3's algorithms also keep the arrays that a VecEnv returned.
         if dispatcher.callbacks and dispatcher.record_step(new_obs, any_ended):  # type: ignore[arg-type]

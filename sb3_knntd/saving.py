@@ -41,7 +41,7 @@ class SavedAlgorithm(OnlineAlgorithm):
         """Check that an environment normalises observations if and only if the model was made for such environments."""
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["_stream", "_prediction_stream", "_is_set_up"]
+        ours = ["_stream", "_prediction_stream", "_is_set_up", "_constant_trace"]
         return [*super()._excluded_save_params(), *ours]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

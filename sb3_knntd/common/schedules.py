@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from sb3_knntd.common.checks import check_schedule
 
@@ -67,3 +67,12 @@ def make_schedule(value: float | Schedule | str) -> FloatSchedule:
     :return: the schedule
     """
     return FloatSchedule(parse_schedule("schedule", value) if isinstance(value, str) else value)
+
+
+def constant_of(schedule: Schedule) -> float | None:
+    """
+    :param schedule: a schedule
+    :return: its value if it is one of SB3's that is constant; ``None`` if it may change
+    """
+    inner = getattr(schedule, "value_schedule", schedule)
+    return float(inner.val) if isinstance(inner, ConstantSchedule) else None

@@ -28,6 +28,7 @@ class StepCheck:
         self._obs_shape = obs_shape
         self._observations_shape = (n_envs, *obs_shape)
         self._per_env = (n_envs,)
+        self._known_types: tuple[Any, ...] = (None, None, None)
 
     def reset(self, observations: Any) -> None:
         """
@@ -44,23 +45,28 @@ class StepCheck:
         :raises ValueError: if one of them is no array of the right shape, or the number of infos is wrong
         """
         try:
-            fits = (
+            if (
                 observations.shape == self._observations_shape
                 and rewards.shape == self._per_env
                 and dones.shape == self._per_env
                 and len(infos) == self._n_envs
-                and observations.dtype.kind in NUMBERS
-                and rewards.dtype.kind in NUMBERS
-                and dones.dtype.kind in TRUTHS
-            )
+            ):
+                known = self._known_types
+                # Types hardly ever change from one step to the next.
+                if observations.dtype is known[0] and rewards.dtype is known[1] and dones.dtype is known[2]:
+                    return
+                types = observations.dtype, rewards.dtype, dones.dtype
+                if types[0].kind in NUMBERS and types[1].kind in NUMBERS and types[2].kind in TRUTHS:
+                    self._known_types = types
+                    return
         except (AttributeError, TypeError):
-            fits = False
-        if not fits:
-            self._refuse("step", "observations", observations, self._observations_shape)
-            self._refuse("step", "rewards", rewards, self._per_env)
-            self._refuse("step", "dones", dones, self._per_env, TRUTHS)
-            count = len(infos) if hasattr(infos, "__len__") else type(infos).__name__
-            raise ValueError(f"the VecEnv's step must return {self._n_envs} infos; got {count}")
+            # What is missing an attribute is named below.
+            pass
+        self._refuse("step", "observations", observations, self._observations_shape)
+        self._refuse("step", "rewards", rewards, self._per_env)
+        self._refuse("step", "dones", dones, self._per_env, TRUTHS)
+        count = len(infos) if hasattr(infos, "__len__") else type(infos).__name__
+        raise ValueError(f"the VecEnv's step must return {self._n_envs} infos; got {count}")
 
     def last_observation(self, env: int, observation: np.ndarray) -> None:
         """

@@ -28,30 +28,24 @@ DIVERGENCE = (
 )
 
 
-class Rates(NamedTuple):
+#: The scheduled parameters at one step: α, at least 0; λ, in [0, 1]; and ε, in [0, 1], or the temperature, above 0.
+#: A plain tuple, since one is made at every step.
+Rates = tuple[float, float, float]
+
+
+def check_rates(rates: Rates, selector: ActionSelector) -> None:
     """
-    The scheduled parameters at one step.
-
-    :param learning_rate: α, at least 0
-    :param trace_decay: λ, in [0, 1]
-    :param exploration: ε, in [0, 1], or the temperature, above 0
+    :param rates: the scheduled parameters at one step
+    :param selector: tells whether the last of them is ε or a temperature
+    :raises ValueError: if a rate is out of range; the message names it
     """
-
-    learning_rate: float
-    trace_decay: float
-    exploration: float
-
-    def check(self, selector: ActionSelector) -> None:
-        """
-        :param selector: tells whether ``exploration`` is ε or a temperature
-        :raises ValueError: if a rate is out of range; the message names it
-        """
-        check_number("learning_rate at this step", self.learning_rate, 0.0)
-        check_number("trace_decay at this step", self.trace_decay, 0.0, 1.0)
-        if selector.rate_is_temperature:
-            check_number("temperature at this step", self.exploration, 0.0, above=True)
-        else:
-            check_number("the exploration rate at this step", self.exploration, 0.0, 1.0)
+    learning_rate, trace_decay, exploration = rates
+    check_number("learning_rate at this step", learning_rate, 0.0)
+    check_number("trace_decay at this step", trace_decay, 0.0, 1.0)
+    if selector.rate_is_temperature:
+        check_number("temperature at this step", exploration, 0.0, above=True)
+    else:
+        check_number("the exploration rate at this step", exploration, 0.0, 1.0)
 
 
 def update_rates(learning_rate: float, trace_decay: float) -> Rates:
@@ -62,7 +56,7 @@ def update_rates(learning_rate: float, trace_decay: float) -> Rates:
     :raises ValueError: if one is out of range
     """
     learning_rate = check_number("learning_rate", learning_rate, 0.0)
-    return Rates(learning_rate, check_number("trace_decay", trace_decay, 0.0, 1.0), 0.0)
+    return learning_rate, check_number("trace_decay", trace_decay, 0.0, 1.0), 0.0
 
 
 class Transitions(NamedTuple):

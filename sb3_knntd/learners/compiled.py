@@ -17,7 +17,7 @@ from sb3_knntd.kernels import td
 from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination, SelectionArguments
 from sb3_knntd.kernels.state import EpisodeArrays, RandomRows, UpdateConfig, WorkArrays, make_state
 from sb3_knntd.kernels.traces import adopt, write_back
-from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, update_rates
+from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, check_rates, update_rates
 from sb3_knntd.perception import Perceiver
 from sb3_knntd.q_table import ActiveTraces, QTable
 
@@ -150,13 +150,19 @@ class CompiledLearner(Learner):
     def _prepare(self) -> None:
         self._learn = td.learn_with(self._workplace.state)
         self._versions = self._workplace.versions
+        episodes = self._workplace.episodes
+        # All neighbours select the same column for one action from mean values: that of the first.
+        of_values = self._workplace.selection.combination == Combination.OF_VALUES
+        self._actions: np.ndarray = (
+            episodes.action_indices[td.CURRENT, :, 0, 0] if of_values else episodes.actions[td.CURRENT]
+        )
 
     def _bind(self) -> None:
         self._workplace.bind()
         self._prepare()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_learn"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_learn", "_actions")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -164,13 +170,7 @@ class CompiledLearner(Learner):
 
     @property
     def actions(self) -> np.ndarray:
-        episodes = self._workplace.episodes
-        # All neighbours selected the same column: read that of the first one.
-        if self._workplace.selection.combination == Combination.OF_VALUES:
-            indices: np.ndarray = episodes.action_indices[td.CURRENT, :, 0, 0]
-            return indices
-        vectors: np.ndarray = episodes.actions[td.CURRENT]
-        return vectors
+        return self._actions
 
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
         super().configure(selector, config)
@@ -228,7 +228,7 @@ class CompiledLearner(Learner):
                 self.table.reserve(self._workplace.work.places.size)
                 self._bind()
             else:
-                rates.check(self.selector)
+                check_rates(rates, self.selector)
                 check_transition(observations, rewards)
                 raise FloatingPointError(DIVERGENCE)
             outcome = self._learn(seen, rewards, ended, learning_rate, trace_decay, exploration)
@@ -267,8 +267,8 @@ class CompiledLearner(Learner):
                         found,
                         distances,
                         done,
-                        rates.learning_rate,
-                        rates.trace_decay,
+                        rates[0],
+                        rates[1],
                     )
                     if outcome == td.NEED_CAPACITY:
                         self.table.make_room(own, k)

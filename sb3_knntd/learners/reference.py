@@ -15,7 +15,7 @@ from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels.selection import UNDRAWN, count_steps
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE
-from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, update_rates
+from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, check_rates, update_rates
 from sb3_knntd.perception import Perceiver, Perception
 from sb3_knntd.q_table import DenseTable, DenseTraces, OneStepTraces, Traces
 
@@ -95,7 +95,7 @@ class TorchLearner(Learner):
         truncated: Mapping[int, np.ndarray],
         rates: Rates,
     ) -> None:
-        rates.check(self.selector)
+        check_rates(rates, self.selector)
         uniforms = self.stream.next()
         check_transition(observations, rewards)
         with self.table.lock:
@@ -112,12 +112,12 @@ class TorchLearner(Learner):
     ) -> None:
         count_steps(self.lengths, ended)
         persistent, over = self.persistent, self._tensor(ended)
-        self._persist(th.where(over[:, None], UNDRAWN, persistent), uniforms[:, 0], rates.exploration)
-        perception, selection = self._select(observations, uniforms[:, 0], rates.exploration, self.persistent)
+        self._persist(th.where(over[:, None], UNDRAWN, persistent), uniforms[:, 0], rates[2])
+        perception, selection = self._select(observations, uniforms[:, 0], rates[2], self.persistent)
         target_values = selection.target_values * self._tensor(~ended)
         if truncated:
             envs, last_observations = list(truncated), np.array(list(truncated.values()))
-            _, last = self._select(last_observations, uniforms[envs, 1], rates.exploration, persistent[envs])
+            _, last = self._select(last_observations, uniforms[envs, 1], rates[2], persistent[envs])
             target_values[envs] = last.target_values
 
         value = self._value()
@@ -139,7 +139,7 @@ class TorchLearner(Learner):
         rates: Rates,
     ) -> None:
         """Credit TD errors, shape (n_envs,), along the traces; ``over`` tells which episodes ended."""
-        corrections = rates.learning_rate * errors
+        corrections = rates[0] * errors
         if self.config.normalized:
             corrections = corrections / probabilities.square().sum(dim=1)
         # On an accelerator, this check would make the host wait.
@@ -149,7 +149,7 @@ class TorchLearner(Learner):
         if before is not None and not self.table.values.abs().max() <= LARGEST_VALUE:
             self.table.values.copy_(before)
             raise FloatingPointError(DIVERGENCE)
-        traces.decay(self.config.gamma * rates.trace_decay, over)
+        traces.decay(self.config.gamma * rates[1], over)
 
     def _copy_if_large(self, corrections: th.Tensor) -> th.Tensor | None:
         """A copy of the table's values, if they could exceed ``LARGEST_VALUE``. Traces are below 1e9."""
