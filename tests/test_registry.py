@@ -16,7 +16,6 @@ import rl_zoo3
 import yaml
 from gymnasium import spaces
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from sb3_knntd.experiments.baselines.stepwise import StepwiseAlgorithm
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_knntd
@@ -25,6 +24,7 @@ from sb3_knntd.cli import main
 from sb3_knntd.experiments.compare.command import Plan, choose_configurations
 from sb3_knntd.experiments.compare.configurations import configuration, fits, is_own, label
 from sb3_knntd.experiments.compare.experiment import prepare
+from sb3_knntd.online_algorithm import OnlineAlgorithm
 from sb3_knntd.registry import ALGORITHMS, Algorithm, Role, for_actions, register, with_role
 from sb3_knntd.zoo.search_space import SearchSpace
 
@@ -60,7 +60,7 @@ def test_every_algorithm_and_every_configuration_is_registered() -> None:
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     registered = {algorithm.load() for algorithm in ALGORITHMS.values()}
-    assert subclasses(KNNAlgorithm) | subclasses(StepwiseAlgorithm) == registered
+    assert subclasses(KNNAlgorithm) | subclasses(OnlineAlgorithm) == registered
     packaged = {file.name for file in files("sb3_knntd.zoo_configs").iterdir() if file.name.endswith(".yml")}
     assert packaged - {"paper.yml"} == {algorithm.config for algorithm in ALGORITHMS.values() if algorithm.config}
 
