@@ -19,7 +19,6 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 import sb3_knntd
-from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.cli import main
 from sb3_knntd.experiments.compare.command import Plan, choose_configurations
 from sb3_knntd.experiments.compare.configurations import configuration, fits, is_own, label
@@ -60,7 +59,7 @@ def test_every_algorithm_and_every_configuration_is_registered() -> None:
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     registered = {algorithm.load() for algorithm in ALGORITHMS.values()}
-    assert subclasses(KNNAlgorithm) | subclasses(OnlineAlgorithm) == registered
+    assert subclasses(OnlineAlgorithm) == registered
     packaged = {file.name for file in files("sb3_knntd.zoo_configs").iterdir() if file.name.endswith(".yml")}
     assert packaged - {"paper.yml"} == {algorithm.config for algorithm in ALGORITHMS.values() if algorithm.config}
 
