@@ -70,7 +70,7 @@ def test_jobs_of_a_dead_node_are_repeated(cluster: Cluster, tmp_path: Path, capf
     # Each was reported once, and stored.
     err = capfd.readouterr().err
     assert [f"t: {n} of 4" in err for n in range(1, 6)] == [True] * 4 + [False]
-    stored = {path.stem: json.loads(path.read_bytes()) for path in (tmp_path / "jobs").iterdir()}
+    stored = {path.stem: json.loads(path.read_bytes()) for path in (tmp_path / "jobs").glob("*.json")}
     assert {key: content.get("result") for key, content in stored.items()} == {
         key: outcome.result for key, outcome in outcomes.items()
     }
