@@ -32,7 +32,7 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!sb3_knntd\b)\w+\..*"),
     (r"py:.*", r"sb3_knntd\.kernels\..*"),
     # Names imported only for type checking, type variables and type aliases.
-    (r"py:.*", r"Axes|BaseCallback|Figure|Path|VecEnv|GymEnv|MaybeCallback|Schedule|State"),
+    (r"py:.*", r"Axes|BaseCallback|Figure|Path|VecEnv|GymEnv|MaybeCallback|Schedule|State|Target"),
     (r"py:.*", r"(sb3_knntd\..*\.)?(Self\w+|Function)"),
     (r"py:.*", r"ActionColumns|Exploration|RandomStream"),
 ]

@@ -24,7 +24,7 @@ SelfOnlineAlgorithm = TypeVar("SelfOnlineAlgorithm", bound="OnlineAlgorithm")
 
 class OnlineAlgorithm(BaseAlgorithm):
     """
-    Acts and learns one step at a time. Subclasses implement :meth:`_act` and :meth:`_learn_from`.
+    Acts and learns one step at a time. Subclasses implement ``_act`` and ``_learn_from``.
 
     The parameters are those of SB3's BaseAlgorithm.
     """

@@ -34,7 +34,7 @@ class QTable(nn.Module, ABC):
     Base class of Q-tables.
 
     Entries can be read from any thread at any time, also while a learner updates them: both hold :attr:`lock`. The
-    values of points with an eligibility trace are stored in :attr:`traces` until the trace has decayed; all methods
+    values of points with an eligibility trace are stored in ``traces`` until the trace has decayed; all methods
     that read the table read them from there.
 
     :param n_actions: number of columns
@@ -87,7 +87,7 @@ class QTable(nn.Module, ABC):
 
     def train(self, mode: bool = True) -> QTable:
         """
-        Set training or evaluation mode, as in torch, and bring :attr:`values` up to date. Before exporting a policy,
+        Set training or evaluation mode, as in torch, and bring ``values`` up to date. Before exporting a policy,
         call ``eval()``.
 
         :param mode: whether to train
@@ -141,7 +141,7 @@ class QTable(nn.Module, ABC):
         """
         Reserve capacity in the table and in traces.
 
-        :param traces: :attr:`traces`, or other traces of this table
+        :param traces: ``traces``, or other traces of this table
         :param n_points: largest number of new points in the next step
         """
         if self._reserve_rows(n_points) | traces.reserve(n_points, self.arrays()):
