@@ -69,6 +69,8 @@ class KNNAlgorithm(SavedAlgorithm):
     tie_break: Any = Hyperparameter()
     n_neighbors: Any = FixedHyperparameter()
     points: Any = FixedHyperparameter()
+    spacing: Any = FixedHyperparameter()
+    max_points: Any = FixedHyperparameter()
     bounds: Any = FixedHyperparameter()
     weights: Any = FixedHyperparameter()
     bandwidth: Any = FixedHyperparameter()
@@ -92,6 +94,8 @@ class KNNAlgorithm(SavedAlgorithm):
         trace_decay: float | Schedule | str,
         n_neighbors: int | str,
         points: Any,
+        spacing: float | str,
+        max_points: int,
         bounds: Any,
         weights: str | Callable[[th.Tensor], Any],
         bandwidth: float,
@@ -135,6 +139,8 @@ class KNNAlgorithm(SavedAlgorithm):
         self.trace_decay = trace_decay
         self.n_neighbors = n_neighbors
         self.points = points
+        self.spacing = spacing
+        self.max_points = max_points
         self.bounds = bounds
         self.weights = weights
         self.bandwidth = bandwidth
@@ -220,6 +226,8 @@ class KNNAlgorithm(SavedAlgorithm):
             self.lr_schedule,
             n_neighbors=self.n_neighbors,
             points=self.points,
+            spacing=self.spacing,
+            max_points=self.max_points,
             bounds=self.bounds,
             weights=self.weights,
             bandwidth=self.bandwidth,
@@ -238,7 +246,7 @@ class KNNAlgorithm(SavedAlgorithm):
                 f"Neighbours by search={self.policy.search_name!r} over {self.policy.perceiver.points.n_points} points"
             )
         self.learner = self._make_learner()
-        self._adapts = self.policy.perceiver.bounds.adaptive
+        self._adapts = self.policy.grows or self.policy.perceiver.bounds.adaptive
         self.set_random_seed(self.seed)
         self._is_set_up = True
 
@@ -407,6 +415,8 @@ class KNNAlgorithm(SavedAlgorithm):
         learner = self.learner
         if not learner.in_episodes:
             assert isinstance(self._last_obs, np.ndarray)
+            if self.policy.grows and not self.policy.perceiver.sees(self._last_obs):
+                self._lay_anew(self._last_obs)
             learner.begin(self._last_obs, self._rates()[2])
         return self.policy.fit_actions(learner.actions)
 
@@ -419,7 +429,10 @@ class KNNAlgorithm(SavedAlgorithm):
             return
         self.learner.step(new_obs, rewards, dones, truncated, self._rates())
         if self._adapts and not self.policy.perceiver.sees(new_obs):
-            self._widen(new_obs)
+            if self.policy.grows:
+                self._lay_anew(new_obs)
+            else:
+                self._widen(new_obs)
 
     def _abandon_episodes(self) -> None:
         self.learner.abandon_episodes()
@@ -473,6 +486,12 @@ class KNNAlgorithm(SavedAlgorithm):
         self._abandon_episodes()
         self._tell_range(f"widened at step {self.num_timesteps}")
 
+    def _lay_anew(self, observations: np.ndarray) -> None:
+        """Lay points that grow anew, and restart the learner's episodes if points were dropped."""
+        if self.policy.lay_anew(observations) is not None:
+            self._abandon_episodes()
+        self.policy.grow(observations)
+
     def _tell_range(self, how: str) -> None:
         if self.verbose >= 1:
             bounds = self.policy.perceiver.bounds
@@ -486,6 +505,8 @@ class KNNAlgorithm(SavedAlgorithm):
 
     def _log(self) -> dict[str, float]:
         summary = {f"train/{key}": value for key, value in self.learner.summary().items()}
+        if self.policy.grows:
+            summary["train/n_points"] = self.policy.perceiver.points.n_points
         return summary | {
             "train/learning_rate": self.lr_schedule(self._current_progress_remaining),
             "train/exploration_rate": self.exploration_rate,

@@ -23,10 +23,11 @@ from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.selection import Exploration, Target
 from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.compiled import GreedyReader
-from sb3_knntd.perception import Lattice, Perception, PerceptionConfig, Points, make_perceiver
+from sb3_knntd.learners.growth import grow
+from sb3_knntd.perception import GrowingPoints, Growth, Lattice, Perception, PerceptionConfig, Points, make_perceiver
 from sb3_knntd.perception.search import SEARCHES
 from sb3_knntd.perception.weights import KernelWeights
-from sb3_knntd.q_table import DenseTable, HashedTable, QTable
+from sb3_knntd.q_table import DenseTable, GrowingTable, HashedTable, QTable
 
 #: ``table="auto"``: maximum size of a dense table of a lattice, bytes; larger tables are hashed.
 DENSE_TABLE_BYTES = 2**28
@@ -40,7 +41,10 @@ class KNNPolicy(BasePolicy):
     :param action_space: Discrete
     :param lr_schedule: has no effect, part of SB3's signature
     :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for all but a Box
-    :param points: ``"auto"``, an int, one int per dimension, or an array (n_points, obs_dim) in observation units
+    :param points: ``"auto"``, ``"grow"``, an int, one int per dimension, or an array (n_points, obs_dim) in observation
+        units
+    :param spacing: of points that grow, see :class:`~sb3_knntd.KNNTD`
+    :param max_points: of points that grow, see :class:`~sb3_knntd.KNNTD`
     :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
         weights (batch, k)
@@ -67,6 +71,8 @@ class KNNPolicy(BasePolicy):
         lr_schedule: Schedule | None = None,
         n_neighbors: int | str = "auto",
         points: Any = "auto",
+        spacing: float | str = "auto",
+        max_points: int = 5000,
         bounds: Any = None,
         weights: str | Callable[[th.Tensor], Any] = "inverse_quadratic",
         bandwidth: float = 1.0,
@@ -83,9 +89,13 @@ class KNNPolicy(BasePolicy):
         if not isinstance(dtype, th.dtype) or dtype not in (th.float32, th.float64):
             raise ValueError(f"policy_kwargs: dtype must be torch.float64 or torch.float32; got {shown(dtype)}")
         compiled = check_flag("policy_kwargs: compiled", compiled)
-        perception = PerceptionConfig(n_neighbors, points, bounds, weights, bandwidth, search)
+        growth = Growth(spacing, max_points) if isinstance(points, str) and points == "grow" else None
+        perception = PerceptionConfig(n_neighbors, growth or points, bounds, weights, bandwidth, search)
         self._arguments = {
             **vars(perception),
+            "points": points,
+            "spacing": spacing,
+            "max_points": max_points,
             "initial_value": initial_value,
             "dtype": dtype,
             "table": table,
@@ -102,7 +112,10 @@ class KNNPolicy(BasePolicy):
         #: the actions that the columns of the table stand for
         self.columns = self._default_columns() if columns is None else columns
         n_actions = int(self.columns.factors[-1])
-        self.table = self._make_table(table, self.perceiver.points, n_actions, initial_value, dtype)
+        if growth:
+            self.table = self._make_growing_table(table, growth.max_points, n_actions, initial_value, dtype)
+        else:
+            self.table = self._make_table(table, self.perceiver.points, n_actions, initial_value, dtype)
         #: selects actions; the algorithm sets one that explores
         self.selector = self._greedy_selector()
         self._reader: GreedyReader | None = None
@@ -145,6 +158,18 @@ class KNNPolicy(BasePolicy):
             "have fewer actions",
         )
         return HashedTable(places.n_points, n_actions, initial_value, dtype)
+
+    def _make_growing_table(
+        self, table: str, max_points: int, n_actions: int, initial_value: float, dtype: th.dtype
+    ) -> QTable:
+        check_word("policy_kwargs: table of points that grow", table, ["auto", "dense"])
+        check_size(
+            f"max_points: a table of {max_points} points and {n_actions} actions",
+            # While points are thinned out there are two.
+            2 * max_points * n_actions * dtype.itemsize,
+            "give fewer points",
+        )
+        return GrowingTable(self.n_neighbors, n_actions, initial_value, dtype)
 
     @property
     def is_compiled(self) -> bool:
@@ -198,7 +223,8 @@ class KNNPolicy(BasePolicy):
 
     def add_points(self, points: np.ndarray | th.Tensor) -> None:
         """
-        Add scattered points. Each is set to the values that the table has at its position; traces are dropped.
+        Add scattered points. Each is set to the values that the table has at its position. All others keep their values
+        and traces.
 
         :param points: shape (n_new, obs_dim), observation units
         :raises ValueError: if the points of the policy are a lattice, or the new ones are invalid
@@ -207,6 +233,50 @@ class KNNPolicy(BasePolicy):
         with self.table.lock, interrupts_held():
             self.perceiver.add_points(points)
             self.table.add_rows(values)
+
+    @property
+    def grows(self) -> bool:
+        """Whether visited observations become points."""
+        return isinstance(self.perceiver.points, GrowingPoints)
+
+    def grow(self, observations: np.ndarray) -> np.ndarray:
+        """
+        Make a point of each observation that lies farther than the spacing from all points, one after the other, as
+        long as there is room: while ``perceiver.points.is_full``, call :meth:`lay_anew` first. The learner calls it for
+        what it perceives. Does nothing if the points do not grow.
+
+        A new point takes the value that was read at its place if a point lies within two spacings, and otherwise the
+        initial value. All other points keep their indices, values and traces.
+
+        :param observations: shape (batch, *obs_shape), observation units, finite
+        :return: the indices of the new points, shape (n,), int64
+        """
+        return grow(self.perceiver, self.table, observations)
+
+    def lay_anew(self, observations: np.ndarray) -> np.ndarray | None:
+        """
+        Lay points that grow anew: scale the open dimensions by the range visited so far, these observations included;
+        drop points that have come nearer than the spacing to one before them; and, if there are ``max_points`` of them,
+        let the spacing grow until there is room for more. It is due when ``perceiver.sees(observations)`` is false. Each
+        remaining point takes the mean of the values of the points nearest to it that were visited. If points were
+        dropped, all traces are too, and the learner must start new episodes.
+
+        :param observations: shape (batch, *obs_shape), observation units, finite
+        :return: the new index of each point, of a dropped one that of the remaining point nearest to it, shape
+            (n_before,), int64; ``None`` if no point was dropped
+        """
+        assert isinstance(self.table, GrowingTable)
+        before = {name: value.clone() for name, value in self.perceiver.state_dict().items()}
+        with self.table.lock, interrupts_held():
+            try:
+                moved = self.perceiver.lay_anew(th.from_numpy(observations))
+                if moved is not None:
+                    self.table.merge_rows(moved)
+            except BaseException:
+                self.perceiver.load_state_dict(before)
+                self.perceiver.fit()
+                raise
+        return None if moved is None else moved.cpu().numpy()
 
     def perceive(self, observation: np.ndarray | th.Tensor) -> Perception:
         """

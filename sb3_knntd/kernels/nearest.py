@@ -191,6 +191,47 @@ def nearest_of_all(scaled, columns, k, indices, distances):
 
 
 @jit
+def thin_out(scaled, squared_spacing, chosen, owners):
+    """
+    Choose points that are further apart than a spacing. In their order, each is chosen unless one chosen before lies
+    within the spacing.
+
+    :param scaled: coordinates of the points, scaled units, shape (n_points, obs_dim)
+    :param squared_spacing: square of the spacing, scaled units
+    :param chosen: output, the chosen points in their order, shape (n_points,), int64; the rest is unused
+    :param owners: output, for each point the place in ``chosen`` of the chosen point nearest to it, at equal distance
+        the first, shape (n_points,), int64
+    :return: number of chosen points
+    """
+    n_points, n_dims = scaled.shape
+    n_chosen = 0
+    for point in range(n_points):
+        near = False
+        for number in range(n_chosen):
+            total = 0.0
+            for j in range(n_dims):
+                difference = scaled[point, j] - scaled[chosen[number], j]
+                total += difference * difference
+            if total <= squared_spacing:
+                near = True
+                break
+        if not near:
+            chosen[n_chosen] = point
+            n_chosen += 1
+    for point in range(n_points):
+        nearest = np.inf
+        for number in range(n_chosen):
+            total = 0.0
+            for j in range(n_dims):
+                difference = scaled[point, j] - scaled[chosen[number], j]
+                total += difference * difference
+            if total < nearest:
+                nearest = total
+                owners[point] = number
+    return n_chosen
+
+
+@jit
 def nearest_on_lattice_batch(scaled, axes, offsets, k, indices, distances):
     """:func:`nearest_on_lattice` for each row of ``scaled``, shape (batch, obs_dim)."""
     for row in range(len(scaled)):

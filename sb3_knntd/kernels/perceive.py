@@ -39,6 +39,8 @@ class PerceptionArguments(NamedTuple):
     :param columns: coordinates of the points, see :func:`~sb3_knntd.kernels.nearest.nearest_of_all`
     :param weighting: a :class:`Weighting`
     :param bandwidth: h, scaled units
+    :param squared_spacing: squared distance from the nearest point beyond which an observation becomes a point, scaled
+        units; infinity if no points can be added
     """
 
     low: np.ndarray
@@ -50,6 +52,7 @@ class PerceptionArguments(NamedTuple):
     columns: np.ndarray
     weighting: int
     bandwidth: float
+    squared_spacing: float = np.inf
 
 
 @jit
@@ -66,6 +69,10 @@ def are_within(observations, low, high):
 def weigh(weighting, bandwidth, squared_distances):
     """Replace squared distances in ascending order, shape (k,), by weights that sum to 1 (eqs. 5 and 6)."""
     nearest, total = squared_distances[0], 0.0
+    if nearest == np.inf:
+        # There are no points yet.
+        squared_distances[:] = 1.0 / len(squared_distances)
+        return
     for i in range(len(squared_distances)):
         if weighting == Weighting.INVERSE_QUADRATIC:
             weight = 1.0 / (1.0 + squared_distances[i] / (bandwidth * bandwidth))
@@ -88,6 +95,7 @@ def perceive(observation, arguments, indices, probabilities):
     :param arguments: see :class:`PerceptionArguments`
     :param indices: output, shape (k,), int64; with search ``OUTSIDE``, input
     :param probabilities: output, shape (k,); with search ``OUTSIDE``, it holds the squared distances on input
+    :return: squared distance of the nearest point, scaled units
     """
     k = len(indices)
     if arguments.search != SearchKind.OUTSIDE:
@@ -101,4 +109,6 @@ def perceive(observation, arguments, indices, probabilities):
             nearest_of_all(scaled, arguments.columns, k, indices, probabilities)
         else:
             raise ValueError("the kernels do not know this search")
+    nearest = probabilities[0]
     weigh(arguments.weighting, arguments.bandwidth, probabilities)
+    return nearest

@@ -38,19 +38,33 @@ from sb3_knntd.kernels.traces import (
 CURRENT, NEXT, TERMINAL = 0, 1, 2
 
 
-#: Outcomes of a step: success; more random numbers or more capacity are needed; a rate is out of range, an observation
-#: or reward is not finite, or values would become too large. Plain integers: returning a member of an enumeration takes
-#: half a microsecond.
-OK, NEED_RANDOM, NEED_CAPACITY, BAD_RATE, NOT_FINITE, DIVERGED = range(6)
+#: Outcomes of a step: success; more random numbers, more capacity or more points are needed; a rate is out of range, an
+#: observation or reward is not finite, or values would become too large. Plain integers: returning a member of an
+#: enumeration takes half a microsecond.
+OK, NEED_RANDOM, NEED_CAPACITY, NEED_POINTS, BAD_RATE, NOT_FINITE, DIVERGED = range(7)
 
 
 @jit
-def perceive_and_select(state, observation, uniforms, rate, which, env):
+def perceive_into(state, observation, which, env):
     """
-    Perceive an observation and select an action. Both are stored in the state.
+    Perceive an observation. The neighbours and their probabilities are stored in the state.
 
     :param state: see :mod:`sb3_knntd.kernels.state`
     :param observation: observation units, shape (obs_dim,)
+    :param which: ``CURRENT``, ``NEXT`` or ``TERMINAL``
+    :param env: index of the environment
+    :return: whether it has to become a point
+    """
+    indices, probabilities = state.indices[which, env], state.probabilities[which, env]
+    return perceive(observation, state, indices, probabilities) > state.squared_spacing
+
+
+@jit
+def select_at(state, uniforms, rate, which, env):
+    """
+    Select an action at a perceived observation. It is stored in the state.
+
+    :param state: see :mod:`sb3_knntd.kernels.state`
     :param uniforms: random numbers in [0, 1), shape (n_uniforms,)
     :param rate: ε or the temperature
     :param which: ``CURRENT``, ``NEXT`` or ``TERMINAL``
@@ -59,7 +73,6 @@ def perceive_and_select(state, observation, uniforms, rate, which, env):
     """
     indices, probabilities = state.indices[which, env], state.probabilities[which, env]
     persistent = state.persistent[env]
-    perceive(observation, state, indices, probabilities)
     # The action at a truncated state is never executed; leave the persistent action unchanged.
     if state.exploration == Exploration.SHARED and which != TERMINAL:
         persist(uniforms, rate, state.lengths, env, state, persistent)
@@ -80,7 +93,8 @@ def begin(state, observations, uniforms, rate):
     state.lengths[1:] = 0.0
     for env in range(len(observations)):
         state.persistent[env, :] = UNDRAWN
-        perceive_and_select(state, observations[env], uniforms[env], rate, CURRENT, env)
+        perceive_into(state, observations[env], CURRENT, env)
+        select_at(state, uniforms[env], rate, CURRENT, env)
 
 
 @inlined
@@ -223,6 +237,15 @@ def _are_valid(learning_rate, trace_decay, rate, state):
     return 0.0 < rate < np.inf if state.exploration == Exploration.SOFTMAX else 0.0 <= rate <= 1.0
 
 
+@inlined
+def _all_finite(observation):
+    """Whether all numbers of an observation, shape (obs_dim,), are finite."""
+    for j in range(len(observation)):
+        if not np.isfinite(observation[j]):
+            return False
+    return True
+
+
 @jit
 def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate):
     """
@@ -235,8 +258,8 @@ def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate)
     :param learning_rate: α
     :param trace_decay: λ
     :param rate: ε or the temperature
-    :return: ``OK``; or ``NEED_RANDOM``, ``NEED_CAPACITY`` or ``BAD_RATE``, in which case nothing has been changed; or
-        ``NOT_FINITE`` or ``DIVERGED``, in which case no value has been changed
+    :return: ``OK``; or ``NEED_RANDOM``, ``NEED_CAPACITY``, ``NEED_POINTS`` or ``BAD_RATE``, in which case nothing has
+        been changed; or ``NOT_FINITE`` or ``DIVERGED``, in which case no value has been changed
     """
     target_values = state.target_values
     if state.n_taken[0] == len(state.rows):
@@ -246,19 +269,25 @@ def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate)
     if not _are_valid(learning_rate, trace_decay, rate, state):
         return BAD_RATE
     uniforms = state.rows[state.n_taken[0]]
+    are_new = False
+    for env in range(len(rewards)):
+        if not (np.isfinite(rewards[env]) and _all_finite(observations[env])):
+            # As in the torch learner, the row has been used.
+            state.n_taken[0] += 1
+            return NOT_FINITE
+        are_new |= perceive_into(state, observations[env], NEXT, env)
+        if state.truncated[env]:
+            are_new |= perceive_into(state, state.last_observations[env], TERMINAL, env)
+    if are_new:
+        return NEED_POINTS
     state.n_taken[0] += 1
     count_steps(state.lengths, ended)
     for env in range(len(rewards)):
-        if not np.isfinite(rewards[env]):
-            return NOT_FINITE
-        for j in range(observations.shape[1]):
-            if not np.isfinite(observations[env, j]):
-                return NOT_FINITE
         if ended[env]:
             state.persistent[env, :] = UNDRAWN
-        value = perceive_and_select(state, observations[env], uniforms[env, 0], rate, NEXT, env)
+        value = select_at(state, uniforms[env, 0], rate, NEXT, env)
         if state.truncated[env]:
-            value = perceive_and_select(state, state.last_observations[env], uniforms[env, 1], rate, TERMINAL, env)
+            value = select_at(state, uniforms[env, 1], rate, TERMINAL, env)
         elif ended[env]:
             value = 0.0
         target_values[env] = value

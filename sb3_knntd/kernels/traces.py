@@ -253,6 +253,18 @@ def adopt(table, traces):
 
 
 @jit
+def overwrite(point, row, table, traces):
+    """Set the values of a point to ``row``, shape (n_actions,), and drop its traces."""
+    place = find(point, traces.active_slots)
+    table.values[row_of(point, table.row_slots)] = row
+    if place >= 0:
+        entries, n_envs = traces.active_entries, traces.active_entries.shape[2] - 2
+        entries[place, :, :n_envs] = 0.0
+        entries[place, :, n_envs] = 1.0
+        entries[place, :, n_envs + 1] = row
+
+
+@jit
 def _rebase(entries, place, clock):
     """Rewrite the bases and the x of an active point for c = 1 and G = 0; whether it still has a trace."""
     n_envs, active = len(clock) - 1, False

@@ -15,6 +15,7 @@ from sb3_knntd.common.state_checks import checked_integer, checked_points, check
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE, LEAST_CLOCK
+from sb3_knntd.learners.growth import grow
 from sb3_knntd.perception import Perceiver
 from sb3_knntd.q_table import QTable
 from sb3_knntd.q_table.active_traces import SMALLEST_CAPACITY
@@ -183,6 +184,11 @@ class Learner(ABC):
         :raises FloatingPointError: if values would diverge; all transitions before have been learned from
         """
 
+    def _grow(self, observations: np.ndarray, truncated: Mapping[int, np.ndarray]) -> None:
+        """Make points of the current observations, and then of those before a truncation, see :func:`grow`."""
+        seen = np.concatenate((observations, list(truncated.values()))) if truncated else observations
+        grow(self.perceiver, self.table, seen)
+
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
         """
         Change parameters within the current episodes.
@@ -244,7 +250,8 @@ class Learner(ABC):
 
     def _check_state(self, state: dict[str, Any]) -> None:
         n_envs, k, n_factors = self.shape
-        n_points, n_actions = self.perceiver.points.n_points, self.table.n_actions
+        # Fewer than k points are followed by free rows.
+        n_points, n_actions = max(self.perceiver.points.n_points, k), self.table.n_actions
         checked_tensor(state, "indices", (n_envs, k), th.int64, 0, n_points - 1)
         probabilities = checked_tensor(state, "probabilities", (n_envs, k), th.float64, 0.0, 1.0 + ROUNDING)
         if probabilities.any() and not ((probabilities.sum(dim=1) - 1.0).abs() <= ROUNDING).all():

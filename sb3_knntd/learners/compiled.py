@@ -184,6 +184,7 @@ class CompiledLearner(Learner):
         seen = as_rows(observations)
         with self.table.lock:
             self.table.drop_traces()
+            self._grow(observations, {})
             self._bind()
             if self.perceiver.search_is_outside:
                 self._find(seen, td.CURRENT)
@@ -207,16 +208,22 @@ class CompiledLearner(Learner):
                 check_transition(observations, rewards)
                 self._find(seen, td.NEXT)
             if not truncated:
-                self._step(seen, observations, rewards, ended, rates)
+                self._step(seen, observations, rewards, ended, truncated, rates)
                 return
             try:
                 self._take_in(truncated)
-                self._step(seen, observations, rewards, ended, rates)
+                self._step(seen, observations, rewards, ended, truncated, rates)
             finally:
                 self._workplace.episodes.truncated[:] = False
 
     def _step(
-        self, seen: np.ndarray, observations: np.ndarray, rewards: np.ndarray, ended: np.ndarray, rates: Rates
+        self,
+        seen: np.ndarray,
+        observations: np.ndarray,
+        rewards: np.ndarray,
+        ended: np.ndarray,
+        truncated: Mapping[int, np.ndarray],
+        rates: Rates,
     ) -> None:
         # Pass the rates separately: numba takes a quarter of a microsecond longer to unbox a tuple.
         learning_rate, trace_decay, exploration = rates
@@ -227,6 +234,10 @@ class CompiledLearner(Learner):
             elif outcome == td.NEED_CAPACITY:
                 self.table.reserve(self._workplace.work.places.size)
                 self._bind()
+            elif outcome == td.NEED_POINTS:
+                self._grow(observations, truncated)
+                if self._versions != (self.perceiver.version, self.table.version):
+                    self._bind()
             else:
                 check_rates(rates, self.selector)
                 check_transition(observations, rewards)

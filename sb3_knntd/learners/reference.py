@@ -80,6 +80,7 @@ class TorchLearner(Learner):
     def begin(self, observations: np.ndarray, exploration_rate: float) -> None:
         check_finite("an observation", observations, range(self.n_envs))
         uniforms = self.stream.next()[:, 0]
+        self._grow(observations, {})
         self._follow_table()
         self.traces.clear()
         self.lengths[1:] = 0.0
@@ -99,6 +100,8 @@ class TorchLearner(Learner):
         uniforms = self.stream.next()
         check_transition(observations, rewards)
         with self.table.lock:
+            self._grow(observations, truncated)
+            self._follow_table()
             self._step(observations, rewards, ended.astype(bool), truncated, rates, uniforms)
 
     def _step(
@@ -196,9 +199,13 @@ class TorchLearner(Learner):
         return rows, perception.probabilities.to(rows.dtype), perception.indices
 
     def _follow_table(self) -> None:
-        """Make new traces if the number of points of the table has changed."""
-        if self.traces.n_points != len(self.table.values):
+        """Make new traces if the number of rows of the table has changed, with those of the old rows if it has grown."""
+        n_before, n_rows = self.traces.n_points, len(self.table.values)
+        if n_before != n_rows:
+            state = self.traces.state()
             self.traces = self._make_traces(self.n_envs)
+            if n_before < n_rows:
+                self.traces.set_state(state)
 
     @property
     def n_traced(self) -> int:

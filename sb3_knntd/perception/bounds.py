@@ -17,6 +17,10 @@ LARGEST_SENSIBLE_BOUND = 1e10
 #: A measured range is widened by this fraction on each side, since a better policy reaches states that a random one
 #: does not.
 MARGIN = 0.25
+#: A visited range may be exceeded by this fraction of it before all is scaled anew.
+SLACK = 0.1
+#: A range below this fraction of the values in it is rounding.
+RESOLUTION = 1e-6
 #: Scaled values are clipped to this size. It is far outside all points, and small enough that a squared distance still
 #: resolves the differences in the other dimensions.
 FARTHEST = 1e4
@@ -144,6 +148,50 @@ class Bounds(nn.Module):
         return self.low + 0.5 * (scaled + 1.0) * (self.high - self.low)
 
 
+class VisitedBounds(Bounds):
+    """
+    Bounds whose open dimensions have the range that was visited. A dimension that was constant so far has one unit on
+    each side of its value.
+
+    :param low: lower bounds, shape (obs_dim,), observation units
+    :param high: upper bounds, shape (obs_dim,), observation units
+    :param adaptive: whether all dimensions are open
+    """
+
+    @property
+    def is_open(self) -> bool:
+        """False: no range has to be measured before learning."""
+        return False
+
+    def widen(self, observations: th.Tensor) -> None:
+        """
+        Set the range of the open dimensions to that of all observations so far.
+
+        :param observations: shape (batch, obs_dim), finite
+        """
+        self.seen_low.copy_(th.minimum(self.seen_low, observations.amin(dim=0)))
+        self.seen_high.copy_(th.maximum(self.seen_high, observations.amax(dim=0)))
+        margin = th.where(self._varied(), 0.0, 1.0)
+        self._set(
+            th.where(self.open, self.seen_low - margin, self.low),
+            th.where(self.open, self.seen_high + margin, self.high),
+        )
+
+    def reach(self) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :return: the values (low, high) beyond which an observation widens the range by more than a tenth, each of
+            shape (obs_dim,), observation units; infinite where the range is not open or has reached its limit
+        """
+        slack = th.where(self._varied(), SLACK * (self.seen_high - self.seen_low), 0.0)
+        low = th.where(self.open & (self.seen_low > self.lowest), self.seen_low - slack, -th.inf)
+        return low, th.where(self.open & (self.seen_high < self.highest), self.seen_high + slack, th.inf)
+
+    def _varied(self) -> th.Tensor:
+        """Whether a range was visited in each dimension, shape (obs_dim,), bool."""
+        largest = th.maximum(self.seen_low.abs(), self.seen_high.abs())
+        return self.seen_high - self.seen_low > RESOLUTION * largest
+
+
 def count_states(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
     """
     :param observation_space: Discrete, or MultiDiscrete or MultiBinary of one axis
@@ -159,29 +207,33 @@ def count_states(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.n
     raise TypeError(f"no states can be counted in {observation_space}")
 
 
-def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space: bool = True) -> Bounds:
+def make_bounds(
+    bounds: Any, observation_space: spaces.Space[Any], *, from_space: bool = True, visited: bool = False
+) -> Bounds:
     """
     :param bounds: ``None`` for the bounds of the space, ``"adaptive"`` to follow the observations within the bounds of
         the space, or a pair (low, high) of arrays of shape (obs_dim,) in observation units
     :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param from_space: whether the bounds of the space hold. They do not for an environment wrapped in VecNormalize;
         then all dimensions are open unless ``bounds`` are given
+    :param visited: whether the open dimensions have the range that was visited, see :class:`VisitedBounds`
     :return: the bounds
     :raises ValueError: if ``bounds`` has another form, is not finite, or low >= high somewhere
     """
+    kind = VisitedBounds if visited else Bounds
     low, high = _bounds_of(observation_space)
     if bounds is None and from_space:
-        return Bounds(low, high)
+        return kind(low, high)
     unbounded = np.full_like(low, -np.inf), np.full_like(high, np.inf)
     if bounds is None:
-        return Bounds(*unbounded)
+        return kind(*unbounded)
     if not isinstance(observation_space, spaces.Box):
         raise ValueError(
             f"bounds must be None for a {type(observation_space).__name__} observation space, whose states are "
             f"the points; got {shown(bounds)}"
         )
     if isinstance(bounds, str) and bounds == "adaptive":
-        return Bounds(*((low, high) if from_space else unbounded), adaptive=True)
+        return kind(*((low, high) if from_space else unbounded), adaptive=True)
     try:
         given_low, given_high = (check_numbers("bounds", bound) for bound in bounds)
     except (TypeError, ValueError) as error:
@@ -204,7 +256,7 @@ def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space
             f"bounds: low must be below high in every dimension; in dimension {dimension} low is "
             f"{given_low[dimension]:g} and high is {given_high[dimension]:g}"
         )
-    return Bounds(given_low, given_high)
+    return kind(given_low, given_high)
 
 
 def _bounds_of(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,9 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.perception.bounds import make_bounds
+from sb3_knntd.perception.growing import Growth
 from sb3_knntd.perception.perceiver import Perceiver
-from sb3_knntd.perception.points import count_neighbors, make_points
+from sb3_knntd.perception.points import Points, count_neighbors, make_points
 from sb3_knntd.perception.search import make_search
 from sb3_knntd.perception.weights import make_weights
 
@@ -22,7 +23,7 @@ class PerceptionConfig:
     The settings of perception as the user gives them. :func:`make_perceiver` checks them.
 
     :param n_neighbors: see :func:`~sb3_knntd.perception.points.count_neighbors`
-    :param points: see :func:`~sb3_knntd.perception.make_points`
+    :param points: a :class:`Growth`, or see :func:`~sb3_knntd.perception.make_points`
     :param bounds: see :func:`~sb3_knntd.perception.make_bounds`
     :param weights: see :func:`~sb3_knntd.perception.make_weights`
     :param bandwidth: h, scaled units
@@ -48,10 +49,15 @@ def make_perceiver(
     :raises ValueError: if a setting is wrong, or does not fit the space; the message names it
     :raises ImportError: if the search needs a library that is not installed
     """
-    points = make_points(config.points, observation_space)
-    n_neighbors = count_neighbors(config.n_neighbors, observation_space, points.n_points, points.obs_dim)
+    growth = config.points if isinstance(config.points, Growth) else None
+    if growth and isinstance(observation_space, spaces.Box):
+        points: Points = growth.make_points(observation_space.shape[0])
+    else:
+        points = make_points("grow" if growth else config.points, observation_space)
+    most = growth.max_points if growth else points.n_points
+    n_neighbors = count_neighbors(config.n_neighbors, observation_space, most, points.obs_dim)
     return Perceiver(
-        make_bounds(config.bounds, observation_space, from_space=bounds_from_space),
+        make_bounds(config.bounds, observation_space, from_space=bounds_from_space, visited=growth is not None),
         points,
         make_search(config.search, points, n_neighbors),
         make_weights(config.weights, config.bandwidth, n_neighbors),

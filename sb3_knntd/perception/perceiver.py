@@ -12,6 +12,7 @@ from torch import nn
 from sb3_knntd.common.tracing import is_traced
 from sb3_knntd.kernels.perceive import PerceptionArguments, SearchKind, are_within
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
+from sb3_knntd.perception.growing import GrowingPoints
 from sb3_knntd.perception.points import Lattice, Points, Scattered
 from sb3_knntd.perception.search import Neighbors, Search
 from sb3_knntd.perception.search.base import nearest_by_tensors
@@ -91,6 +92,11 @@ class Perceiver(nn.Module):
         """Update what depends on the bounds, their device and the points. Has to be called when one of them changed."""
         self.search.fit(self.bounds)
         self._reach = [bound.cpu().numpy() for bound in self.bounds.reach()]
+        self._renew()
+
+    def _renew(self) -> None:
+        """Make new arguments for the kernels."""
+        self._squared_spacing = self.points.squared_spacing
         self.arguments = self._make_arguments()
         self.search_is_outside = self.arguments is not None and self.arguments.search == SearchKind.OUTSIDE
         self.version += 1
@@ -105,6 +111,7 @@ class Perceiver(nn.Module):
             limit=FARTHEST,
             weighting=int(self.weights.WEIGHTING),
             bandwidth=self.weights.bandwidth,
+            squared_spacing=self._squared_spacing,
             **self.search.kernel_arguments()._asdict(),
         )
 
@@ -122,7 +129,8 @@ class Perceiver(nn.Module):
                 f"(n_points, {self.points.obs_dim})"
             )
         added = self.points.append(points)
-        self.fit()
+        if self.search.extend(self.bounds, added) or self.points.squared_spacing != self._squared_spacing:
+            self._renew()
         return added
 
     def find(self, observations: th.Tensor) -> Neighbors:
@@ -144,9 +152,12 @@ class Perceiver(nn.Module):
     def sees(self, observations: np.ndarray) -> bool:
         """
         :param observations: shape (batch, *obs_shape), any number type, observation units
-        :return: whether :meth:`widen` would change nothing: all lie within the bounds that can still move
+        :return: whether :meth:`widen` or :meth:`lay_anew` would change nothing: all lie within the bounds that can
+            still move, and there is room for more points if they grow
         """
-        return bool(are_within(observations.reshape(-1, self.bounds.obs_dim), *self._reach))
+        return not self.points.is_full and bool(
+            are_within(observations.reshape(-1, self.bounds.obs_dim), *self._reach)
+        )
 
     def widen(self, observations: th.Tensor) -> Regridding | None:
         """
@@ -159,6 +170,20 @@ class Perceiver(nn.Module):
         self.bounds.widen(self._flat(observations))
         self.fit()
         return Regridding(self, before) if isinstance(self.points, Lattice) else None
+
+    def lay_anew(self, observations: th.Tensor) -> th.Tensor | None:
+        """
+        Scale the open dimensions by the range visited so far, and thin out points that grow.
+
+        :param observations: shape (batch, *obs_shape), any number type, observation units
+        :return: the new index of each point, of a dropped one that of the remaining point nearest to it, shape
+            (n_before,), int64; ``None`` if all points stay
+        """
+        assert isinstance(self.points, GrowingPoints)
+        self.bounds.widen(th.cat((self._flat(observations), self.points.places.to(self.bounds.low))))
+        moved = self.points.thin(self.bounds)
+        self.fit()
+        return moved
 
     def forward(self, observations: th.Tensor) -> Perception:
         """
@@ -177,8 +202,26 @@ class Perceiver(nn.Module):
             indices, squared_distances = nearest_by_tensors(scaled, places, self.search.n_neighbors)
         else:
             indices, squared_distances = self.search.query(scaled)
+        return Perception(indices, self.weigh(squared_distances))
+
+    def weigh(self, squared_distances: th.Tensor) -> th.Tensor:
+        """
+        :param squared_distances: of the neighbours in ascending order, shape (batch, k), scaled units; infinite where
+            there are fewer than k points
+        :return: the probabilities of the neighbours, shape (batch, k)
+        """
+        if self.points.n_points < self.search.n_neighbors:
+            return self._weigh_some(squared_distances)
         weights = self.weights(squared_distances)
-        return Perception(indices, weights / weights.sum(dim=1, keepdim=True))
+        return weights / weights.sum(dim=1, keepdim=True)
+
+    def _weigh_some(self, squared_distances: th.Tensor) -> th.Tensor:
+        """Probabilities of fewer than k points, 0 for the missing ones; all the same if there is no point."""
+        is_point = th.isfinite(squared_distances)
+        known = th.where(is_point, squared_distances, 0.0)
+        weights = self.weights(th.where(is_point, known, known.amax(dim=1, keepdim=True)))
+        weights = th.where(is_point | ~is_point.any(dim=1, keepdim=True), weights, 0.0)
+        return weights / weights.sum(dim=1, keepdim=True)
 
     def _flat(self, observations: th.Tensor) -> th.Tensor:
         return observations.reshape(-1, self.bounds.obs_dim).to(self.bounds.low)
@@ -186,6 +229,7 @@ class Perceiver(nn.Module):
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         name, k = prefix + "points.places", self.search.n_neighbors
         places = state_dict.get(name)
-        if isinstance(places, th.Tensor) and places.shape[:1] < (k,):
+        grows = isinstance(self.points, GrowingPoints)
+        if not grows and isinstance(places, th.Tensor) and places.shape[:1] < (k,):
             raise ValueError(f"{name} must have at least n_neighbors={k} rows; got shape {tuple(places.shape)}")
         super()._load_from_state_dict(state_dict, prefix, *args)

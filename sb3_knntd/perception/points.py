@@ -29,6 +29,19 @@ class Points(ABC):
     #: number of observation dimensions
     obs_dim: int
 
+    #: whether the points have to be laid anew before another can be added
+    is_full = False
+
+    @property
+    def n_reserved(self) -> int:
+        """Number of points that a search should have room for."""
+        return self.n_points
+
+    @property
+    def squared_spacing(self) -> float:
+        """Squared distance from the nearest point beyond which an observation becomes a point; mostly infinite."""
+        return math.inf
+
     @abstractmethod
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
         """
@@ -136,7 +149,9 @@ def make_points(points: Any, observation_space: spaces.Space[Any]) -> Points:
     obs_dim = observation_space.shape[0]
     if isinstance(points, str):
         if points != "auto":
-            raise ValueError(f"points must be 'auto', an int, one int a dimension, or an array; got {shown(points)}")
+            raise ValueError(
+                f"points must be 'auto', 'grow', an int, one int a dimension, or an array; got {shown(points)}"
+            )
         per_dimension = min(AUTO_POINTS_PER_DIMENSION, max(2, round(AUTO_POINTS ** (1 / obs_dim))))
         return Lattice((per_dimension,) * obs_dim)
 

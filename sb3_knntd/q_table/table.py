@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_knntd.common.state_checks import checked_points, checked_tensor
 from sb3_knntd.common.tracing import is_traced
-from sb3_knntd.kernels.traces import TableArrays, read_rows, rehash, write_back
+from sb3_knntd.kernels.traces import TableArrays, overwrite, read_rows, rehash, write_back
 from sb3_knntd.q_table.active_traces import ActiveTraces, make_slots
 
 #: Number of points whose values are carried over at a time.
@@ -154,7 +154,7 @@ class QTable(nn.Module, ABC):
     @abstractmethod
     def add_rows(self, values: th.Tensor) -> None:
         """
-        Append the rows of new points.
+        Append the rows of new points. All others keep their values and traces.
 
         :param values: their values, shape (n_new, n_actions)
         """
@@ -245,7 +245,6 @@ class DenseTable(QTable):
 
     def add_rows(self, values: th.Tensor) -> None:
         with self.lock:
-            self.drop_traces()
             n_points = len(self.values) + len(values)
             grown = th.cat((self.values, values.to(self.values)))
             visited = self._no_visits(n_points).to(self.values.device)
@@ -304,6 +303,122 @@ class DenseTable(QTable):
                 checked_tensor(state_dict, prefix + "values", (None, None))
             self.forget_traces()
             super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+class GrowingTable(DenseTable):
+    """
+    A table to which rows are added while learning goes on: the traces stay. Its arrays have free rows, which hold the
+    initial value. The first ``n_neighbors`` rows can be read before their points come.
+
+    :param n_neighbors: number of rows, in use or free, that there always are
+    :param n_actions: number of columns
+    :param initial_value: initial value of all entries
+    :param dtype: floating type of the entries
+    """
+
+    SMALLEST = 64
+
+    def __init__(self, n_neighbors: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
+        super().__init__(max(self.SMALLEST, n_neighbors), n_actions, initial_value, dtype)
+        self.n_neighbors = n_neighbors
+        #: number of rows in use
+        self.n_rows = 0
+
+    @property
+    def n_visited(self) -> int:
+        return int(self._visits()[: self.n_rows].sum())
+
+    def entries(self) -> th.Tensor:
+        return super().entries()[: self.n_rows]
+
+    def add_rows(self, values: th.Tensor) -> None:
+        values = values.to(self.values)
+        with self.lock:
+            n_rows = self.n_rows + len(values)
+            if n_rows > len(self.values):
+                self._write_back()
+                self._set(*self._made_of(self.values[: self.n_rows], self._visits()[: self.n_rows], 2 * n_rows))
+            for row, new in enumerate(values, self.n_rows):
+                self._visit_not(row)
+                if self.values.is_cpu:
+                    overwrite(row, new.numpy(), self.arrays(), self.traces.arrays)
+                else:
+                    self.values[row] = new
+            self.n_rows = n_rows
+
+    def merge_rows(self, moved: th.Tensor) -> None:
+        """
+        Give each point the mean of the values of the points that became it, of the visited ones if there are any. All
+        traces are dropped.
+
+        :param moved: the new index of each point, shape (n_rows,), int64, counted from 0 without gaps
+        """
+        with self.lock:
+            values, visits = self.entries(), self._visits()[: self.n_rows]
+            n_rows = int(moved.max()) + 1
+            counts = self._sums(moved, visits.to(values.dtype)[:, None], n_rows)
+            visited = counts[:, 0] > 0
+            # Where no point was visited, all count.
+            counting = (visits | ~visited[moved]).to(values.dtype)[:, None]
+            means = self._sums(moved, counting * values, n_rows) / self._sums(moved, counting, n_rows)
+            grown = self._made_of(means, visited, 2 * n_rows)
+            self.forget_traces()
+            self._set(*grown)
+            self.n_rows = n_rows
+
+    def resize(self, n_points: int) -> None:
+        """
+        Change the number of rows in use. All entries are set to the initial value.
+
+        :param n_points: number of rows
+        """
+        with self.lock:
+            nothing = self.values.new_full((n_points, self.n_actions), self.initial_value)
+            grown = self._made_of(nothing, self.visited.new_zeros(n_points, dtype=th.bool), 2 * n_points)
+            self.forget_traces()
+            self._set(*grown)
+            self.n_rows = n_points
+
+    @staticmethod
+    def _sums(groups: th.Tensor, rows: th.Tensor, n_groups: int) -> th.Tensor:
+        """Sums over the rows of each group."""
+        return rows.new_zeros((n_groups, rows.shape[1])).index_add_(0, groups, rows)
+
+    def _made_of(self, values: th.Tensor, visits: th.Tensor, n_rows: int) -> tuple[th.Tensor, th.Tensor]:
+        """New arrays of ``n_rows`` rows or more that begin with these."""
+        n_rows = max(n_rows, self.SMALLEST, self.n_neighbors)
+        grown = values.new_full((n_rows, self.n_actions), self.initial_value)
+        grown[: len(values)] = values
+        visited = self._no_visits(n_rows).to(values.device)
+        self._visit(visited, visits.nonzero()[:, 0])
+        return grown, visited
+
+    def _set(self, values: th.Tensor, visited: th.Tensor) -> None:
+        self.values, self.visited = values, visited
+        self.version += 1
+
+    def _visit_not(self, row: int) -> None:
+        self.visited[row >> 3] &= ~(1 << (row & 7)) & 0xFF
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        with self.lock:
+            visited = self._no_visits(self.n_rows).to(self.visited.device)
+            self._visit(visited, self._visits()[: self.n_rows].nonzero()[:, 0])
+            destination[prefix + "values"] = self.entries().clone()
+            destination[prefix + "visited"] = visited
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        if not {prefix + "values", prefix + "visited"} <= set(state_dict):
+            # torch reports what is missing.
+            super()._load_from_state_dict(state_dict, prefix, *args)
+            return
+        values = checked_tensor(state_dict, prefix + "values", (self.n_rows, self.n_actions))
+        visited = checked_tensor(state_dict, prefix + "visited", self._no_visits(self.n_rows).shape, th.uint8)
+        with self.lock:
+            bits = th.from_numpy(np.unpackbits(visited.cpu().numpy()[:-1], bitorder="little")[: self.n_rows]).bool()
+            grown = self._made_of(values.to(self.values), bits.to(self.visited.device), 2 * self.n_rows)
+            self.forget_traces()
+            self._set(*grown)
 
 
 class _Rows(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from sb3_knntd.common.checks import check_size, check_word
 from sb3_knntd.kernels import jit
+from sb3_knntd.perception.growing import GrowingPoints
 from sb3_knntd.perception.points import Lattice, Points
 from sb3_knntd.perception.search.base import Neighbors, Search, SearchArguments
 from sb3_knntd.perception.search.brute import BruteSearch
@@ -45,6 +46,8 @@ def make_search(search: str, points: Points, n_neighbors: int) -> Search:
     """
     check_word("search", search, ["auto", *SEARCHES])
     kind = SEARCHES[choose_search(points) if search == "auto" else search]
+    if isinstance(points, GrowingPoints) and kind is not BruteSearch:
+        raise ValueError(f"search must be 'auto' or 'brute' for points that grow, which change often; got {search!r}")
     if isinstance(points, Lattice) and kind is not LatticeSearch:
         # All coordinates are held twice while they are brought into the order that the search needs.
         check_size(
@@ -62,4 +65,4 @@ def choose_search(points: Points) -> str:
     """
     if isinstance(points, Lattice) and (jit.AVAILABLE or points.n_points > FEW_POINTS):
         return "lattice"
-    return "brute" if points.n_points <= FEW_POINTS or points.obs_dim > 12 else "kd_tree"
+    return "brute" if isinstance(points, GrowingPoints) or points.n_points <= FEW_POINTS or points.obs_dim > 12 else "kd_tree"

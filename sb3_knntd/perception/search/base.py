@@ -64,6 +64,17 @@ class Search(ABC):
         :param bounds: the range that is mapped to [-1, 1]
         """
 
+    def extend(self, bounds: Bounds, added: th.Tensor) -> bool:
+        """
+        Read the coordinates of points that were added.
+
+        :param bounds: the range that is mapped to [-1, 1], as in the last :meth:`fit`
+        :param added: the new points, shape (n,), int64
+        :return: whether :meth:`kernel_arguments` have changed
+        """
+        self.fit(bounds)
+        return True
+
     @abstractmethod
     def query(self, scaled: th.Tensor) -> Neighbors:
         """

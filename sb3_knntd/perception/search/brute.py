@@ -13,15 +13,28 @@ MAX_DISTANCES = 2**26
 
 
 class BruteSearch(Search):
-    """Computes the distances to all points and takes the first k by (distance, index)."""
+    """
+    Computes the distances to all points and takes the first k by (distance, index). If the points are fewer than k,
+    places without a point follow them, at an infinite distance.
+    """
 
+    #: coordinates of the points, and infinite ones in room for more, shape (obs_dim, n_points or more)
     _columns: th.Tensor
 
     def fit(self, bounds: Bounds) -> None:
-        self._columns = self.points.coordinates(bounds).T.contiguous()
+        columns = self.points.coordinates(bounds).T
+        n_columns = max(self.points.n_reserved, self.n_neighbors)
+        self._columns = columns.new_full((self.points.obs_dim, n_columns), th.inf)
+        self._columns[:, : self.points.n_points] = columns
+
+    def extend(self, bounds: Bounds, added: th.Tensor) -> bool:
+        if self.points.n_points > self._columns.shape[1]:
+            return super().extend(bounds, added)
+        self._columns[:, added] = self.points.coordinates(bounds, added).T
+        return False
 
     def query(self, scaled: th.Tensor) -> Neighbors:
-        rows = max(1, MAX_DISTANCES // self.points.n_points)
+        rows = max(1, MAX_DISTANCES // self._columns.shape[1])
         parts = [self._query(chunk) for chunk in scaled.split(rows)]
         return parts[0] if len(parts) == 1 else Neighbors(*(th.cat(column) for column in zip(*parts, strict=True)))
 
@@ -31,7 +44,7 @@ class BruteSearch(Search):
     def _query(self, scaled: th.Tensor) -> Neighbors:
         # Summed dimension by dimension: th.cdist takes square roots, and matrix products for many rows. Both round, and
         # break the ties that are common on a lattice.
-        distances = th.zeros((len(scaled), self.points.n_points), dtype=scaled.dtype, device=scaled.device)
+        distances = th.zeros((len(scaled), self._columns.shape[1]), dtype=scaled.dtype, device=scaled.device)
         for dimension, column in enumerate(self._columns):
             distances += (scaled[:, dimension, None] - column).square_()
         return smallest(distances, self.n_neighbors)

@@ -1,0 +1,46 @@
+"""Growth of the points and the table together."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+
+from sb3_knntd.common.interrupts import interrupts_held
+from sb3_knntd.perception import GrowingPoints, Perceiver
+from sb3_knntd.perception.growing import REACH
+from sb3_knntd.q_table import GrowingTable, QTable
+
+
+def grow(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.ndarray:
+    """
+    Make a point of each observation that lies farther than the spacing from all points, one after the other, as long as
+    there is room. Do nothing if the points do not grow.
+
+    A new point takes the value that was read at its place if a point lies within two spacings, and otherwise the
+    initial value. All other points keep their values and traces.
+
+    :param perceiver: finds and weighs the neighbours of an observation
+    :param table: the Q-table
+    :param observations: shape (batch, *obs_shape), observation units
+    :return: the indices of the new points, shape (n,), int64
+    """
+    points = perceiver.points
+    if not isinstance(points, GrowingPoints):
+        return np.empty(0, np.int64)
+    assert isinstance(table, GrowingTable)
+    first = points.n_points
+    seen = th.from_numpy(np.asarray(observations, dtype=np.float64)).reshape(-1, points.obs_dim).to(table.values.device)
+    with table.lock:
+        for observation in seen.split(1):
+            indices, squared_distances = perceiver.find(observation)
+            nearest = float(squared_distances[0, 0])
+            if not nearest > points.squared_spacing:
+                continue
+            values = table.values.new_full((1, table.n_actions), table.initial_value)
+            if nearest <= (REACH * float(points.spacing)) ** 2:
+                weights = perceiver.weigh(squared_distances).to(values.dtype)
+                values = (weights[..., None] * table.rows(indices)).sum(dim=1)
+            with interrupts_held():
+                perceiver.add_points(observation.cpu())
+                table.add_rows(values)
+    return np.arange(first, points.n_points)
