@@ -245,8 +245,8 @@ class KNNPolicy(BasePolicy):
         long as there is room: while ``perceiver.points.is_full``, call :meth:`lay_anew` first. The learner calls it for
         what it perceives. Does nothing if the points do not grow.
 
-        A new point takes the value that was read at its place if a point lies within two spacings, and otherwise the
-        initial value. All other points keep their indices, values and traces.
+        A new point takes the values that were read at its place, or the initial value where that is higher. All other
+        points keep their indices, values and traces.
 
         :param observations: shape (batch, *obs_shape), observation units, finite
         :return: the indices of the new points, shape (n,), int64

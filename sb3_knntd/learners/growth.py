@@ -7,7 +7,6 @@ import torch as th
 
 from sb3_knntd.common.interrupts import interrupts_held
 from sb3_knntd.perception import GrowingPoints, Perceiver
-from sb3_knntd.perception.growing import REACH
 from sb3_knntd.q_table import GrowingTable, QTable
 
 
@@ -16,8 +15,9 @@ def grow(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.nd
     Make a point of each observation that lies farther than the spacing from all points, one after the other, as long as
     there is room. Do nothing if the points do not grow.
 
-    A new point takes the value that was read at its place if a point lies within two spacings, and otherwise the
-    initial value. All other points keep their values and traces.
+    A new point takes the values that were read at its place, or the initial value where that is higher: a pessimistic
+    table goes on from what it has learned nearby, and with an optimistic one the agent still tries what is new. All
+    other points keep their values and traces.
 
     :param perceiver: finds and weighs the neighbours of an observation
     :param table: the Q-table
@@ -33,13 +33,10 @@ def grow(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.nd
     with table.lock:
         for observation in seen.split(1):
             indices, squared_distances = perceiver.find(observation)
-            nearest = float(squared_distances[0, 0])
-            if not nearest > points.squared_spacing:
+            if not squared_distances[0, 0] > points.squared_spacing:
                 continue
-            values = table.values.new_full((1, table.n_actions), table.initial_value)
-            if nearest <= (REACH * float(points.spacing)) ** 2:
-                weights = perceiver.weigh(squared_distances).to(values.dtype)
-                values = (weights[..., None] * table.rows(indices)).sum(dim=1)
+            weights = perceiver.weigh(squared_distances).to(table.values.dtype)
+            values = (weights[..., None] * table.rows(indices)).sum(dim=1).clamp(min=table.initial_value)
             with interrupts_held():
                 perceiver.add_points(observation.cpu())
                 table.add_rows(values)

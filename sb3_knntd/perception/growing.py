@@ -17,8 +17,6 @@ from sb3_knntd.perception.points import Scattered
 #: ``spacing="auto"`` in scaled units: for each dimension but the first, and the least.
 SPACING_PER_DIMENSION = 0.06
 LEAST_SPACING = 0.04
-#: A new point takes the value that is read at its place if the nearest point lies within this number of spacings.
-REACH = 2.0
 
 
 @dataclass(frozen=True)
