@@ -242,9 +242,8 @@ class KNNAlgorithm(SavedAlgorithm):
         self._stream = RandomStream((self.n_envs, 2, selector.n_uniforms))
         self._prediction_stream = RandomStream((selector.n_uniforms,), purpose=1)
         if self.verbose >= 1:
-            print(
-                f"Neighbours by search={self.policy.search_name!r} over {self.policy.perceiver.points.n_points} points"
-            )
+            points = "growing" if self.policy.grows else f"{self.policy.perceiver.points.n_points}"
+            print(f"Neighbours by search={self.policy.search_name!r} over {points} points")
         self.learner = self._make_learner()
         self._adapts = self.policy.grows or self.policy.perceiver.bounds.adaptive
         self.set_random_seed(self.seed)
@@ -490,6 +489,7 @@ class KNNAlgorithm(SavedAlgorithm):
         """Lay points that grow anew, and restart the learner's episodes if points were dropped."""
         if self.policy.lay_anew(observations) is not None:
             self._abandon_episodes()
+        # The nearest point may have been dropped.
         self.policy.grow(observations)
 
     def _tell_range(self, how: str) -> None:

@@ -23,7 +23,7 @@ from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.selection import Exploration, Target
 from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.compiled import GreedyReader
-from sb3_knntd.learners.growth import grow
+from sb3_knntd.learners.growth import grow, lay_anew
 from sb3_knntd.perception import GrowingPoints, Growth, Lattice, Perception, PerceptionConfig, Points, make_perceiver
 from sb3_knntd.perception.search import SEARCHES
 from sb3_knntd.perception.weights import KernelWeights
@@ -89,8 +89,9 @@ class KNNPolicy(BasePolicy):
         if not isinstance(dtype, th.dtype) or dtype not in (th.float32, th.float64):
             raise ValueError(f"policy_kwargs: dtype must be torch.float64 or torch.float32; got {shown(dtype)}")
         compiled = check_flag("policy_kwargs: compiled", compiled)
-        growth = Growth(spacing, max_points) if isinstance(points, str) and points == "grow" else None
-        perception = PerceptionConfig(n_neighbors, growth or points, bounds, weights, bandwidth, search)
+        growth = Growth(spacing, max_points)
+        grows = isinstance(points, str) and points == "grow"
+        perception = PerceptionConfig(n_neighbors, growth if grows else points, bounds, weights, bandwidth, search)
         self._arguments = {
             **vars(perception),
             "points": points,
@@ -112,8 +113,8 @@ class KNNPolicy(BasePolicy):
         #: the actions that the columns of the table stand for
         self.columns = self._default_columns() if columns is None else columns
         n_actions = int(self.columns.factors[-1])
-        if growth:
-            self.table = self._make_growing_table(table, growth.max_points, n_actions, initial_value, dtype)
+        if grows:
+            self.table: QTable = self._make_growing_table(table, n_actions, initial_value, dtype)
         else:
             self.table = self._make_table(table, self.perceiver.points, n_actions, initial_value, dtype)
         #: selects actions; the algorithm sets one that explores
@@ -159,9 +160,9 @@ class KNNPolicy(BasePolicy):
         )
         return HashedTable(places.n_points, n_actions, initial_value, dtype)
 
-    def _make_growing_table(
-        self, table: str, max_points: int, n_actions: int, initial_value: float, dtype: th.dtype
-    ) -> QTable:
+    def _make_growing_table(self, table: str, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
+        assert isinstance(self.perceiver.points, GrowingPoints)
+        max_points = self.perceiver.points.max_points
         check_word("policy_kwargs: table of points that grow", table, ["auto", "dense"])
         check_size(
             f"max_points: a table of {max_points} points and {n_actions} actions",
@@ -256,27 +257,17 @@ class KNNPolicy(BasePolicy):
     def lay_anew(self, observations: np.ndarray) -> np.ndarray | None:
         """
         Lay points that grow anew: scale the open dimensions by the range visited so far, these observations included;
-        drop points that have come nearer than the spacing to one before them; and, if there are ``max_points`` of them,
-        let the spacing grow until there is room for more. It is due when ``perceiver.sees(observations)`` is false. Each
-        remaining point takes the mean of the values of the points nearest to it that were visited. If points were
-        dropped, all traces are too, and the learner must start new episodes.
+        drop points that have come nearer than the spacing to another; and, if there are ``max_points`` of them, let the
+        spacing grow until there is room. It is due when ``perceiver.sees(observations)`` is false.
+
+        Each remaining point takes the mean of the values of the points nearest to it that were visited. If a point was
+        dropped, all traces are, and the learner must start new episodes.
 
         :param observations: shape (batch, *obs_shape), observation units, finite
         :return: the new index of each point, of a dropped one that of the remaining point nearest to it, shape
-            (n_before,), int64; ``None`` if no point was dropped
+            (n_before,), int64; ``None`` if all points stay
         """
-        assert isinstance(self.table, GrowingTable)
-        before = {name: value.clone() for name, value in self.perceiver.state_dict().items()}
-        with self.table.lock, interrupts_held():
-            try:
-                moved = self.perceiver.lay_anew(th.from_numpy(observations))
-                if moved is not None:
-                    self.table.merge_rows(moved)
-            except BaseException:
-                self.perceiver.load_state_dict(before)
-                self.perceiver.fit()
-                raise
-        return None if moved is None else moved.cpu().numpy()
+        return lay_anew(self.perceiver, self.table, observations)
 
     def perceive(self, observation: np.ndarray | th.Tensor) -> Perception:
         """

@@ -31,6 +31,8 @@ REFUSED: dict[str, tuple[list[Any], str]] = {
     "trace_decay": ([-0.01, 1.01, NAN, "0.9", None, lambda progress: 2 * progress, lambda _: NAN], "[0, 1]"),
     "n_neighbors": ([0, -1, 1.5, NAN, "many", None, True, np.True_, [3], np.array([3]), 10**400], ">= 1"),
     "bandwidth": ([0.0, -1.0, NAN, INF, "wide", None, 1e-320, True], "[1e-100, inf)"),
+    "spacing": ([0.0, -1.0, NAN, INF, "wide", None, 1e5, True, [0.1]], "[1e-100, 10000]"),
+    "max_points": ([1, 0, -5, 2.5, NAN, "many", None, True, 10**400], ">= 2"),
     "initial_value": ([NAN, INF, -INF, "0", None, False, 1e300], "[-1e+30, 1e+30]"),
     "exploration_initial_eps": ([-0.1, 1.1, NAN, "0.1", None], "[0, 1]"),
     "exploration_final_eps": ([-0.1, 1.1, NAN, "0.1", None], "[0, 1]"),

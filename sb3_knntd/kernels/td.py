@@ -237,15 +237,6 @@ def _are_valid(learning_rate, trace_decay, rate, state):
     return 0.0 < rate < np.inf if state.exploration == Exploration.SOFTMAX else 0.0 <= rate <= 1.0
 
 
-@inlined
-def _all_finite(observation):
-    """Whether all numbers of an observation, shape (obs_dim,), are finite."""
-    for j in range(len(observation)):
-        if not np.isfinite(observation[j]):
-            return False
-    return True
-
-
 @jit
 def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate):
     """
@@ -271,7 +262,10 @@ def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate)
     uniforms = state.rows[state.n_taken[0]]
     are_new = False
     for env in range(len(rewards)):
-        if not (np.isfinite(rewards[env]) and _all_finite(observations[env])):
+        are_finite = np.isfinite(rewards[env])
+        for j in range(observations.shape[1]):
+            are_finite &= np.isfinite(observations[env, j])
+        if not are_finite:
             # As in the torch learner, the row has been used.
             state.n_taken[0] += 1
             return NOT_FINITE

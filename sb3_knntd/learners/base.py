@@ -15,8 +15,8 @@ from sb3_knntd.common.state_checks import checked_integer, checked_points, check
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE, LEAST_CLOCK
-from sb3_knntd.learners.growth import grow
-from sb3_knntd.perception import Perceiver
+from sb3_knntd.learners.growth import grow, lay_anew
+from sb3_knntd.perception import GrowingPoints, Perceiver
 from sb3_knntd.q_table import QTable
 from sb3_knntd.q_table.active_traces import SMALLEST_CAPACITY
 
@@ -171,7 +171,7 @@ class Learner(ABC):
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         """
         Learn off-policy from given transitions, one after the other. The traces of the current episodes are not
-        affected.
+        affected, unless points that grow are laid anew.
 
         The target is r + γ max Q(s', ·), for Ex⟨a⟩ r + γ Σ p(i) max Q(i, ·). Traces are cut as in Watkins's Q(λ):
         before an action whose value is lower than that of the greedy one, and where an episode ends (Watkins 1989;
@@ -187,6 +187,20 @@ class Learner(ABC):
     def _grow(self, observations: np.ndarray, truncated: Mapping[int, np.ndarray]) -> None:
         """Make points of the current observations, and then of those before a truncation, see :func:`grow`."""
         seen = np.concatenate((observations, list(truncated.values()))) if truncated else observations
+        grow(self.perceiver, self.table, seen)
+
+    def _grow_for(self, transitions: Transitions) -> None:
+        """Make points of given observations as if they had been visited."""
+        points = self.perceiver.points
+        if not isinstance(points, GrowingPoints):
+            return
+        seen, after, terminated = map(np.asarray, (transitions[0], transitions[3], transitions[4]))
+        seen = np.concatenate((seen, after[~terminated.astype(bool)]))
+        # Each time that the points are laid anew there is room for at least one more, at a larger spacing.
+        while not self.perceiver.sees(seen):
+            if lay_anew(self.perceiver, self.table, seen) is not None:
+                self.abandon_episodes()
+            grow(self.perceiver, self.table, seen)
         grow(self.perceiver, self.table, seen)
 
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:

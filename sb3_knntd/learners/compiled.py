@@ -247,6 +247,7 @@ class CompiledLearner(Learner):
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         rates = update_rates(learning_rate, trace_decay)
         columns = transitions.columns(self.selector, self.perceiver.bounds.obs_dim)
+        self._grow_for(transitions)
         n, k = len(columns), self.shape[1]
         before, after = (
             as_rows(np.asarray(array)).reshape(n, -1).astype(np.float64)

@@ -41,3 +41,32 @@ def grow(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.nd
                 perceiver.add_points(observation.cpu())
                 table.add_rows(values)
     return np.arange(first, points.n_points)
+
+
+def lay_anew(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.ndarray | None:
+    """
+    Lay points that grow anew: scale the open dimensions by the range visited so far, these observations included; drop
+    points that have come nearer than the spacing to another; and, if there are as many as there may be, let the spacing
+    grow until there is room. It is due when ``perceiver.sees(observations)`` is false.
+
+    Each remaining point takes the mean of the values of the points nearest to it that were visited. If a point was
+    dropped, all traces are, and the learner must start new episodes.
+
+    :param perceiver: finds and weighs the neighbours of an observation
+    :param table: the Q-table
+    :param observations: shape (batch, *obs_shape), observation units
+    :return: the new index of each point, of a dropped one that of the remaining point nearest to it, shape (n_before,),
+        int64; ``None`` if all points stay
+    """
+    assert isinstance(table, GrowingTable)
+    before = {name: value.clone() for name, value in perceiver.state_dict().items()}
+    with table.lock, interrupts_held():
+        try:
+            moved = perceiver.lay_anew(th.from_numpy(observations))
+            if moved is not None:
+                table.merge_rows(moved)
+        except BaseException:
+            perceiver.load_state_dict(before)
+            perceiver.fit()
+            raise
+    return None if moved is None else moved.cpu().numpy()

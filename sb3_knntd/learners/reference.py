@@ -166,6 +166,7 @@ class TorchLearner(Learner):
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         rates = update_rates(learning_rate, trace_decay)
         columns = transitions.columns(self.selector, self.perceiver.bounds.obs_dim)
+        self._grow_for(transitions)
         with self.table.lock:
             self._follow_table()
             traces = self._make_traces(1)
@@ -199,7 +200,7 @@ class TorchLearner(Learner):
         return rows, perception.probabilities.to(rows.dtype), perception.indices
 
     def _follow_table(self) -> None:
-        """Make new traces if the number of rows of the table has changed, with those of the old rows if it has grown."""
+        """Make new traces if the number of rows of the table has changed; if it has grown, the old ones are kept."""
         n_before, n_rows = self.traces.n_points, len(self.table.values)
         if n_before != n_rows:
             state = self.traces.state()

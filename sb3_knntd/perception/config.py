@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.perception.bounds import make_bounds
-from sb3_knntd.perception.growing import Growth
+from sb3_knntd.perception.growing import GrowingPoints, Growth
 from sb3_knntd.perception.perceiver import Perceiver
 from sb3_knntd.perception.points import Points, count_neighbors, make_points
 from sb3_knntd.perception.search import make_search
@@ -49,15 +49,15 @@ def make_perceiver(
     :raises ValueError: if a setting is wrong, or does not fit the space; the message names it
     :raises ImportError: if the search needs a library that is not installed
     """
-    growth = config.points if isinstance(config.points, Growth) else None
-    if growth and isinstance(observation_space, spaces.Box):
-        points: Points = growth.make_points(observation_space.shape[0])
+    grows = isinstance(config.points, Growth)
+    if isinstance(config.points, Growth) and isinstance(observation_space, spaces.Box):
+        points: Points = config.points.make_points(observation_space.shape[0])
     else:
-        points = make_points("grow" if growth else config.points, observation_space)
-    most = growth.max_points if growth else points.n_points
+        points = make_points("grow" if grows else config.points, observation_space)
+    most = points.max_points if isinstance(points, GrowingPoints) else points.n_points
     n_neighbors = count_neighbors(config.n_neighbors, observation_space, most, points.obs_dim)
     return Perceiver(
-        make_bounds(config.bounds, observation_space, from_space=bounds_from_space, visited=growth is not None),
+        make_bounds(config.bounds, observation_space, from_space=bounds_from_space, visited=grows),
         points,
         make_search(config.search, points, n_neighbors),
         make_weights(config.weights, config.bandwidth, n_neighbors),

@@ -11,7 +11,7 @@ import torch as th
 from sb3_knntd.common.checks import LEAST, check_integer, check_number, shown
 from sb3_knntd.common.state_checks import checked_tensor
 from sb3_knntd.kernels.nearest import thin_out
-from sb3_knntd.perception.bounds import Bounds
+from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.points import Scattered
 
 #: ``spacing="auto"`` in scaled units: for each dimension but the first, and the least.
@@ -22,28 +22,33 @@ LEAST_SPACING = 0.04
 @dataclass(frozen=True)
 class Growth:
     """
-    The settings of points that grow.
+    The settings of points that grow. They are checked at once.
 
-    :param spacing: no two points are nearer than this, scaled units; or ``"auto"``: 0.06 (obs_dim - 1), at least 0.04
+    :param spacing: no two points are nearer than this, scaled units, up to 10,000; or ``"auto"``: 0.06 (obs_dim - 1), at least 0.04
     :param max_points: largest number of points, >= 2
+    :raises ValueError: if a setting is invalid; the message names it
     """
 
     spacing: float | str = "auto"
     max_points: int = 5000
 
+    def __post_init__(self) -> None:
+        check_integer("max_points", self.max_points, 2)
+        if not isinstance(self.spacing, str):
+            check_number("spacing", self.spacing, LEAST, FARTHEST)
+        elif self.spacing != "auto":
+            raise ValueError(
+                f"spacing must be a finite number in [{LEAST:g}, {FARTHEST:g}], or 'auto'; got {shown(self.spacing)}"
+            )
+
     def make_points(self, obs_dim: int) -> GrowingPoints:
         """
         :param obs_dim: number of observation dimensions
         :return: the points, none yet
-        :raises ValueError: if a setting is invalid; the message names it
         """
-        if not isinstance(self.spacing, str):
-            spacing = check_number("spacing", self.spacing, LEAST)
-        elif self.spacing == "auto":
-            spacing = max(LEAST_SPACING, SPACING_PER_DIMENSION * (obs_dim - 1))
-        else:
-            raise ValueError(f"spacing must be a finite number above 0, or 'auto'; got {shown(self.spacing)}")
-        return GrowingPoints(obs_dim, spacing, check_integer("max_points", self.max_points, 2))
+        automatic = max(LEAST_SPACING, SPACING_PER_DIMENSION * (obs_dim - 1))
+        spacing = automatic if isinstance(self.spacing, str) else float(self.spacing)
+        return GrowingPoints(obs_dim, spacing, int(self.max_points))
 
 
 class GrowingPoints(Scattered):

@@ -155,9 +155,7 @@ class Perceiver(nn.Module):
         :return: whether :meth:`widen` or :meth:`lay_anew` would change nothing: all lie within the bounds that can
             still move, and there is room for more points if they grow
         """
-        return not self.points.is_full and bool(
-            are_within(observations.reshape(-1, self.bounds.obs_dim), *self._reach)
-        )
+        return not self.points.is_full and bool(are_within(observations.reshape(-1, self.bounds.obs_dim), *self._reach))
 
     def widen(self, observations: th.Tensor) -> Regridding | None:
         """

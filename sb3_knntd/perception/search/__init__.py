@@ -65,4 +65,5 @@ def choose_search(points: Points) -> str:
     """
     if isinstance(points, Lattice) and (jit.AVAILABLE or points.n_points > FEW_POINTS):
         return "lattice"
-    return "brute" if isinstance(points, GrowingPoints) or points.n_points <= FEW_POINTS or points.obs_dim > 12 else "kd_tree"
+    few = points.n_points <= FEW_POINTS or points.obs_dim > 12
+    return "brute" if few or isinstance(points, GrowingPoints) else "kd_tree"
