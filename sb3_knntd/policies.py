@@ -24,7 +24,16 @@ from sb3_knntd.kernels.selection import Exploration, Target
 from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.compiled import GreedyReader
 from sb3_knntd.learners.growth import grow, lay_anew
-from sb3_knntd.perception import GrowingPoints, Growth, Lattice, Perception, PerceptionConfig, Points, make_perceiver
+from sb3_knntd.perception import (
+    GrowingPoints,
+    Growth,
+    Lattice,
+    Perception,
+    PerceptionConfig,
+    Points,
+    Scattered,
+    make_perceiver,
+)
 from sb3_knntd.perception.search import SEARCHES
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.q_table import DenseTable, GrowingTable, HashedTable, QTable
@@ -193,8 +202,10 @@ class KNNPolicy(BasePolicy):
         The perception points, shape (n_points, obs_dim), observation units; with a hashed table, only the visited
         ones. The range of unbounded dimensions is [-1, 1] until ``learn`` has measured it.
         """
-        bounds = self.perceiver.bounds
-        return bounds.unscale(self.perceiver.points.coordinates(bounds, self.table.points()))
+        bounds, points = self.perceiver.bounds, self.perceiver.points
+        if isinstance(points, Scattered):
+            return points.places.clone()
+        return bounds.unscale(points.coordinates(bounds, self.table.points()))
 
     @property
     def q_table(self) -> th.Tensor:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import jit
+from sb3_knntd.kernels.jit import inlined, jit
 from sb3_knntd.kernels.nearest import nearest_of_all, nearest_on_lattice
 
 
@@ -65,6 +65,37 @@ def are_within(observations, low, high):
     return True
 
 
+@inlined
+def scale(observation, low, width, limit):
+    """Scale an observation, shape (obs_dim,), see :class:`PerceptionArguments`."""
+    scaled = np.empty(len(observation))
+    for j in range(len(observation)):
+        scaled[j] = min(max(2.0 * ((observation[j] - low[j]) / width[j]) - 1.0, -limit), limit)
+    return scaled
+
+
+@jit
+def first_far(observations, first, low, width, limit, columns, squared_spacing):
+    """
+    Find an observation that is far from all points.
+
+    :param observations: observation units, shape (batch, obs_dim)
+    :param first: the observation to begin with
+    :param low: see :class:`PerceptionArguments`
+    :param width: likewise
+    :param limit: likewise
+    :param columns: likewise
+    :param squared_spacing: squared distance from the nearest point that counts as far, scaled units
+    :return: the first observation that lies farther than that from all points; the length of the batch if none does
+    """
+    index, distance = np.empty(1, np.int64), np.empty(1)
+    for row in range(first, len(observations)):
+        nearest_of_all(scale(observations[row], low, width, limit), columns, 1, index, distance)
+        if distance[0] > squared_spacing:
+            return row
+    return len(observations)
+
+
 @jit
 def weigh(weighting, bandwidth, squared_distances):
     """Replace squared distances in ascending order, shape (k,), by weights that sum to 1 (eqs. 5 and 6)."""
@@ -99,10 +130,7 @@ def perceive(observation, arguments, indices, probabilities):
     """
     k = len(indices)
     if arguments.search != SearchKind.OUTSIDE:
-        scaled = np.empty(len(observation))
-        low, width, limit = arguments.low, arguments.width, arguments.limit
-        for j in range(len(observation)):
-            scaled[j] = min(max(2.0 * ((observation[j] - low[j]) / width[j]) - 1.0, -limit), limit)
+        scaled = scale(observation, arguments.low, arguments.width, arguments.limit)
         if arguments.search == SearchKind.LATTICE:
             nearest_on_lattice(scaled, arguments.axes, arguments.offsets, k, indices, probabilities)
         elif arguments.search == SearchKind.ALL_POINTS:

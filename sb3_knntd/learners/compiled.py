@@ -18,10 +18,9 @@ from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination, SelectionA
 from sb3_knntd.kernels.state import EpisodeArrays, RandomRows, UpdateConfig, WorkArrays, make_state
 from sb3_knntd.kernels.traces import adopt, write_back
 from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, check_rates, update_rates
+from sb3_knntd.learners.growth import FLOAT32, as_rows
 from sb3_knntd.perception import Perceiver
 from sb3_knntd.q_table import ActiveTraces, QTable
-
-FLOAT32 = np.dtype(np.float32)
 
 
 class Workplace:
@@ -389,13 +388,3 @@ class GreedyReader:
             selected = np.empty((n, k, n_factors), np.int64)
             td.recommend(place.state, seen, self._uniforms, indices, probabilities, selected)
         return selected, probabilities
-
-
-def as_rows(observations: np.ndarray) -> np.ndarray:
-    """
-    :param observations: shape (batch, obs_dim), or (batch,) for Discrete, any number type
-    :return: the same, shape (batch, obs_dim), as float32 or float64, so that kernels are compiled for only two types
-    """
-    if observations.dtype is not FLOAT32:
-        observations = observations.astype(np.float64, copy=False)
-    return observations if observations.ndim == 2 else observations[:, None]

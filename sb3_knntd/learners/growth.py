@@ -9,6 +9,8 @@ from sb3_knntd.common.interrupts import interrupts_held
 from sb3_knntd.perception import GrowingPoints, Perceiver
 from sb3_knntd.q_table import GrowingTable, QTable
 
+FLOAT32 = np.dtype(np.float32)
+
 
 def grow(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.ndarray:
     """
@@ -28,19 +30,30 @@ def grow(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.nd
     if not isinstance(points, GrowingPoints):
         return np.empty(0, np.int64)
     assert isinstance(table, GrowingTable)
-    first = points.n_points
-    seen = th.from_numpy(np.asarray(observations, dtype=np.float64)).reshape(-1, points.obs_dim).to(table.values.device)
+    n_before = points.n_points
+    seen = as_rows(observations).reshape(-1, points.obs_dim)
     with table.lock:
-        for observation in seen.split(1):
-            indices, squared_distances = perceiver.find(observation)
-            if not squared_distances[0, 0] > points.squared_spacing:
-                continue
-            weights = perceiver.weigh(squared_distances).to(table.values.dtype)
-            values = (weights[..., None] * table.rows(indices)).sum(dim=1).clamp(min=table.initial_value)
-            with interrupts_held():
-                perceiver.add_points(observation.cpu())
-                table.add_rows(values)
-    return np.arange(first, points.n_points)
+        row = perceiver.first_new(seen)
+        while row < len(seen):
+            indices, probabilities = perceiver.perceive_one(seen[row])
+            values = (probabilities[..., None].to(table.values.dtype) * table.rows(indices)).sum(dim=1)
+            _add_point(perceiver, table, seen[row : row + 1], values.clamp(min=table.initial_value))
+            row = perceiver.first_new(seen, row + 1)
+    return np.arange(n_before, points.n_points)
+
+
+def _add_point(perceiver: Perceiver, table: GrowingTable, place: np.ndarray, values: th.Tensor) -> None:
+    """Add one point; on failure, leave all as it was."""
+    assert isinstance(perceiver.points, GrowingPoints)
+    n_before = perceiver.points.n_points
+    with interrupts_held():
+        try:
+            perceiver.add_points(place)
+            table.add_rows(values)
+        except BaseException:
+            perceiver.points.truncate(n_before)
+            perceiver.fit()
+            raise
 
 
 def lay_anew(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> np.ndarray | None:
@@ -70,3 +83,13 @@ def lay_anew(perceiver: Perceiver, table: QTable, observations: np.ndarray) -> n
             perceiver.fit()
             raise
     return None if moved is None else moved.cpu().numpy()
+
+
+def as_rows(observations: np.ndarray) -> np.ndarray:
+    """
+    :param observations: shape (batch, obs_dim), or (batch,) for Discrete, any number type
+    :return: the same, shape (batch, obs_dim), as float32 or float64, so that kernels are compiled for only two types
+    """
+    if observations.dtype is not FLOAT32:
+        observations = observations.astype(np.float64, copy=False)
+    return observations if observations.ndim == 2 else observations[:, None]

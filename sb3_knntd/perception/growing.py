@@ -24,7 +24,8 @@ class Growth:
     """
     The settings of points that grow. They are checked at once.
 
-    :param spacing: no two points are nearer than this, scaled units, up to 10,000; or ``"auto"``: 0.06 (obs_dim - 1), at least 0.04
+    :param spacing: no two points are nearer than this, scaled units, up to 10,000; or ``"auto"``: 0.06 (obs_dim - 1),
+        at least 0.04
     :param max_points: largest number of points, >= 2
     :raises ValueError: if a setting is invalid; the message names it
     """

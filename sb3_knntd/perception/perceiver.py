@@ -10,7 +10,7 @@ import torch as th
 from torch import nn
 
 from sb3_knntd.common.tracing import is_traced
-from sb3_knntd.kernels.perceive import PerceptionArguments, SearchKind, are_within
+from sb3_knntd.kernels.perceive import PerceptionArguments, SearchKind, are_within, first_far, perceive
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.growing import GrowingPoints
 from sb3_knntd.perception.points import Lattice, Points, Scattered
@@ -140,6 +140,35 @@ class Perceiver(nn.Module):
         """
         return self.search.query(self.bounds.scale(self._flat(observations)))
 
+    def first_new(self, observations: np.ndarray, first: int = 0) -> int:
+        """
+        :param observations: shape (batch, obs_dim), any number type, observation units
+        :param first: the observation to begin with
+        :return: the first observation that lies farther than the spacing from all points, if there is room for one
+            more; the length of the batch if there is none
+        """
+        limit = self._squared_spacing
+        if self.arguments is not None and self.arguments.search == SearchKind.ALL_POINTS:
+            arguments = self.arguments
+            low, width, farthest, columns = arguments.low, arguments.width, arguments.limit, arguments.columns
+            return int(first_far(observations, first, low, width, farthest, columns, limit))
+        seen = th.from_numpy(observations[first:]).to(self.bounds.low.device)
+        far = (self.find(seen).squared_distances[:, 0] > limit).nonzero()
+        return first + int(far[0, 0]) if len(far) else len(observations)
+
+    def perceive_one(self, observation: np.ndarray) -> Perception:
+        """
+        :param observation: shape (obs_dim,), float32 or float64, observation units
+        :return: its perception, by the compiled search if possible, which takes a few microseconds
+        """
+        if self.arguments is None or self.search_is_outside:
+            perception: Perception = self(th.from_numpy(observation).to(self.bounds.low.device))
+            return perception
+        k = self.search.n_neighbors
+        indices, probabilities = np.empty((1, k), np.int64), np.empty((1, k))
+        perceive(observation, self.arguments, indices[0], probabilities[0])
+        return Perception(th.from_numpy(indices), th.from_numpy(probabilities))
+
     def measure(self, observations: th.Tensor) -> None:
         """
         Widen the bounds of the open dimensions to include these observations.
@@ -208,13 +237,13 @@ class Perceiver(nn.Module):
             there are fewer than k points
         :return: the probabilities of the neighbours, shape (batch, k)
         """
-        if self.points.n_points < self.search.n_neighbors:
-            return self._weigh_some(squared_distances)
+        if isinstance(self.points, GrowingPoints):
+            return self._weigh_existing(squared_distances)
         weights = self.weights(squared_distances)
         return weights / weights.sum(dim=1, keepdim=True)
 
-    def _weigh_some(self, squared_distances: th.Tensor) -> th.Tensor:
-        """Probabilities of fewer than k points, 0 for the missing ones; all the same if there is no point."""
+    def _weigh_existing(self, squared_distances: th.Tensor) -> th.Tensor:
+        """Like :meth:`weigh`, 0 where there is no point; all the same if there is none at all."""
         is_point = th.isfinite(squared_distances)
         known = th.where(is_point, squared_distances, 0.0)
         weights = self.weights(th.where(is_point, known, known.amax(dim=1, keepdim=True)))

@@ -113,6 +113,12 @@ class Scattered(Points, nn.Module):
         self._set(th.cat((self.places, th.from_numpy(check_places(new_points, self.obs_dim)).to(self.places))))
         return th.arange(first, self.n_points, device=self.places.device)
 
+    def truncate(self, n_points: int) -> None:
+        """
+        :param n_points: number of points to keep, the first ones
+        """
+        self._set(self.places[:n_points])
+
     def _set(self, places: th.Tensor) -> None:
         self.places, self.n_points = places, len(places)
 

@@ -361,7 +361,8 @@ class GrowingTable(DenseTable):
             # Where no point was visited, all count.
             counting = (visits | ~visited[moved]).to(values.dtype)[:, None]
             means = self._sums(moved, counting * values, n_rows) / self._sums(moved, counting, n_rows)
-            grown = self._made_of(means, visited, 2 * n_rows)
+            # As many rows as before: another thread may be about to read a point by its old index.
+            grown = self._made_of(means, visited, len(self.values))
             self.forget_traces()
             self._set(*grown)
             self.n_rows = n_rows

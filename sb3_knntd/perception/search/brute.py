@@ -34,18 +34,20 @@ class BruteSearch(Search):
         return False
 
     def query(self, scaled: th.Tensor) -> Neighbors:
-        rows = max(1, MAX_DISTANCES // self._columns.shape[1])
-        parts = [self._query(chunk) for chunk in scaled.split(rows)]
+        # Another thread may replace them.
+        columns = self._columns
+        rows = max(1, MAX_DISTANCES // columns.shape[1])
+        parts = [self._query(chunk, columns) for chunk in scaled.split(rows)]
         return parts[0] if len(parts) == 1 else Neighbors(*(th.cat(column) for column in zip(*parts, strict=True)))
 
     def kernel_arguments(self) -> SearchArguments:
         return SearchArguments(int(SearchKind.ALL_POINTS), columns=self._columns.numpy())
 
-    def _query(self, scaled: th.Tensor) -> Neighbors:
+    def _query(self, scaled: th.Tensor, columns: th.Tensor) -> Neighbors:
         # Summed dimension by dimension: th.cdist takes square roots, and matrix products for many rows. Both round, and
         # break the ties that are common on a lattice.
-        distances = th.zeros((len(scaled), self._columns.shape[1]), dtype=scaled.dtype, device=scaled.device)
-        for dimension, column in enumerate(self._columns):
+        distances = th.zeros((len(scaled), columns.shape[1]), dtype=scaled.dtype, device=scaled.device)
+        for dimension, column in enumerate(columns):
             distances += (scaled[:, dimension, None] - column).square_()
         return smallest(distances, self.n_neighbors)
 
