@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from importlib.metadata import version
 
+from sb3_knntd.dyna import KNNDyna
 from sb3_knntd.exa import ExA
 from sb3_knntd.filters import DeltaFilter, VecDeltaFilter
 from sb3_knntd.knntd import KNNTD
 from sb3_knntd.perception import Perception
 from sb3_knntd.policies import ExAPolicy, KNNPolicy
 
-__all__ = ["KNNTD", "DeltaFilter", "ExA", "ExAPolicy", "KNNPolicy", "Perception", "VecDeltaFilter"]
+__all__ = ["KNNTD", "DeltaFilter", "ExA", "ExAPolicy", "KNNDyna", "KNNPolicy", "Perception", "VecDeltaFilter"]
 __version__ = version("sb3-knntd")

@@ -81,7 +81,7 @@ class KNNAlgorithm(SavedAlgorithm):
     #: a schedule, and its value if that is constant
     _constant_trace: tuple[Any, float | None] = (None, None)
     #: Type of the supported action spaces, and advice for unsupported ones.
-    _supported_action_space: ClassVar[type[spaces.Space[Any]]]
+    _supported_action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]]
     _action_space_advice: ClassVar[str]
 
     def __init__(
@@ -190,10 +190,10 @@ class KNNAlgorithm(SavedAlgorithm):
                 f"network to choose. Call {call}"
             )
         if isinstance(policy, type):
-            if not (issubclass(policy, default) and policy.acts_in is cls._supported_action_space):
+            if not (issubclass(policy, default) and policy.acts_in in cls._supported_action_spaces):
                 raise ValueError(
                     f"policy of {cls.__name__} must be {default.__name__} or a subclass with actions in a "
-                    f"{cls._supported_action_space.__name__}; got {policy.__name__}. Call {call}"
+                    f"{cls._action_space_names()}; got {policy.__name__}. Call {call}"
                 )
             return policy, env
         if env is not None:
@@ -201,11 +201,15 @@ class KNNAlgorithm(SavedAlgorithm):
         return default, policy
 
     @classmethod
+    def _action_space_names(cls) -> str:
+        return " or ".join(space.__name__ for space in cls._supported_action_spaces)
+
+    @classmethod
     def _check_spaces(cls, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
         check_observation_space(cls.__name__, observation_space)
-        if not isinstance(action_space, cls._supported_action_space):
+        if not isinstance(action_space, cls._supported_action_spaces):
             raise ValueError(
-                f"{cls.__name__} takes actions in a {cls._supported_action_space.__name__} space; got {action_space}. "
+                f"{cls.__name__} takes actions in a {cls._action_space_names()} space; got {action_space}. "
                 f"{cls._action_space_advice}"
             )
 

@@ -67,7 +67,7 @@ class ExA(KNNAlgorithm):
     exploration_hold: Any = Hyperparameter()
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": ExAPolicy}
     _algorithm: ClassVar[str] = "ExA"
-    _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Box
+    _supported_action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Box,)
     _action_space_advice: ClassVar[str] = "For Discrete actions use KNNTD"
 
     def __init__(

@@ -88,7 +88,7 @@ class KNNTD(KNNAlgorithm):
     temperature: Any = Hyperparameter()
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"KNNPolicy": KNNPolicy}
     _algorithm: ClassVar[str] = "KNNTD"
-    _supported_action_space: ClassVar[type[spaces.Space[Any]]] = spaces.Discrete
+    _supported_action_spaces: ClassVar[tuple[type[spaces.Space[Any]], ...]] = (spaces.Discrete,)
     _action_space_advice: ClassVar[str] = (
         "For a Box of actions use ExA; MultiDiscrete and MultiBinary can be numbered into one Discrete space by "
         "a gymnasium.ActionWrapper"

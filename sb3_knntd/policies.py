@@ -374,8 +374,7 @@ class KNNPolicy(BasePolicy):
         assert isinstance(observation, th.Tensor)
         assert isinstance(self.action_space, spaces.Discrete)
         rows, probabilities = self._exact_rows(observation)
-        selected = self.selector.greedy_indices(rows, probabilities)
-        return self.selector.actions_of(selected, probabilities) + int(self.action_space.start)
+        return self.selector.greedy_actions(rows, probabilities) + int(self.action_space.start)
 
     def _to_tensor(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         array = observation.cpu().numpy() if isinstance(observation, th.Tensor) else np.asarray(observation)
@@ -533,7 +532,7 @@ class ExAPolicy(KNNPolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         rows, probabilities = self._exact_rows(observation)
-        actions = self.selector.actions_of(self.selector.greedy_indices(rows, probabilities), probabilities)
+        actions = self.selector.greedy_actions(rows, probabilities)
         # Like fit_actions, but with torch operations that can be traced.
         if self._actions_are_whole:
             actions = actions.round()

@@ -137,6 +137,16 @@ class ActionSelector(ABC):
         :return: indices of actions, shape (batch,), int64, or vectors, shape (batch, action_dim), action units
         """
 
+    def greedy_actions(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        """
+        The greedy action.
+
+        :param rows: table rows of the neighbours, shape (batch, k, n_actions)
+        :param probabilities: of the neighbours, shape (batch, k)
+        :return: indices of actions, shape (batch,), int64, or vectors, shape (batch, action_dim), action units
+        """
+        return self.actions_of(self.greedy_indices(rows, probabilities), probabilities)
+
     @abstractmethod
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
         """

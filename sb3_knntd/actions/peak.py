@@ -1,0 +1,90 @@
+"""Selection of a continuous action between action points."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+
+from sb3_knntd.actions.columns import ActionColumns
+from sb3_knntd.actions.exploration import EpsilonGreedy, greedy
+from sb3_knntd.actions.selection import MeanValueSelector, mean_rows
+from sb3_knntd.kernels.selection import Target
+
+#: Parabolas that are flatter than this, relative to their values, have no peak.
+LEAST_CURVATURE = 1e-12
+
+
+class PeakSelector(MeanValueSelector):
+    """
+    The neighbours' values are averaged, and the action is the peak of a parabola through the value of the best action
+    point and those next to it, in each dimension. It moves by at most half of the way to the next action point. At the
+    first and the last action point of a dimension, the action is that point.
+
+    :param columns: the action points, one column for every combination
+    :param random_ties: whether ties between best columns are broken at random while training
+    """
+
+    def __init__(self, columns: ActionColumns, random_ties: bool) -> None:
+        super().__init__(columns, Target.Q_LEARNING, EpsilonGreedy(), random_ties)
+        if self.n_factors != 1:
+            raise ValueError("action_table must be 'joint': a column for every combination of action points")
+        shape = [len(points) for points in columns.lists]
+        numbers = np.arange(len(columns.points)).reshape(shape)
+        places = np.stack(np.unravel_index(np.arange(len(columns.points)), shape), axis=1)
+        sides = [
+            [self._shifted(numbers, places, dimension, step) for step in (-1, 1)] for dimension in range(len(shape))
+        ]
+        #: the columns below and above each column in each dimension, itself at the ends, (action_dim, 2, n_columns)
+        self._sides = th.from_numpy(np.array(sides))
+        self._points = th.from_numpy(columns.points)
+
+    @staticmethod
+    def _shifted(numbers: np.ndarray, places: np.ndarray, dimension: int, step: int) -> np.ndarray:
+        shifted = places.copy()
+        shifted[:, dimension] = np.clip(shifted[:, dimension] + step, 0, numbers.shape[dimension] - 1)
+        columns: np.ndarray = numbers[tuple(shifted.T)]
+        return columns
+
+    def peak(self, values: th.Tensor, best: th.Tensor) -> th.Tensor:
+        """
+        :param values: mean values of the action points, shape (batch, n_columns)
+        :param best: the best columns, shape (batch,), int64
+        :return: actions, shape (batch, action_dim), action units
+        """
+        points, sides = self._points.to(values.device), self._sides.to(values.device)
+        actions = points[best].clone()
+        middle = values.gather(1, best[:, None])[:, 0]
+        for dimension in range(actions.shape[1]):
+            low, high = sides[dimension, 0][best], sides[dimension, 1][best]
+            x_low, x_mid, x_high = (points[column, dimension] for column in (low, best, high))
+            left, right = x_mid - x_low, x_high - x_mid
+            # Divided differences of the parabola through the three values.
+            slope_left = (middle - values.gather(1, low[:, None])[:, 0]).double() / left
+            slope_right = (values.gather(1, high[:, None])[:, 0] - middle).double() / right
+            curvature = (slope_right - slope_left) / (left + right)
+            slope = (slope_left * right + slope_right * left) / (left + right)
+            offset = (-0.5 * slope / curvature).clamp(min=-0.5 * left, max=0.5 * right)
+            has_peak = (left > 0) & (right > 0) & (curvature * (left + right) ** 2 < -LEAST_CURVATURE * middle.abs().clamp(min=1.0))
+            actions[:, dimension] += th.where(has_peak, offset, 0.0)
+        return actions
+
+    def greedy_actions(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        values = mean_rows(rows, probabilities)
+        return self.peak(values, greedy(values))
+
+    def actions_of(self, action_indices: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        return self._points.to(probabilities.device)[action_indices[:, 0, 0]]
+
+    def columns_of(self, actions: np.ndarray) -> np.ndarray:
+        given = np.asarray(actions, dtype=np.float64)
+        action_dim = self.columns.points.shape[1]
+        if given.ndim != 2 or given.shape[1] != action_dim:
+            raise ValueError(f"actions must have shape (n, {action_dim}); got {given.shape}")
+        if not np.isfinite(given).all():
+            raise ValueError("actions must be finite; got NaN or infinity in them")
+        shape = [len(points) for points in self.columns.lists]
+        nearest = [
+            np.abs(given[:, dimension, None] - points).argmin(axis=1)
+            for dimension, points in enumerate(self.columns.lists)
+        ]
+        return np.ravel_multi_index(nearest, shape)[:, None].astype(np.int64)
