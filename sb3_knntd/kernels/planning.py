@@ -321,6 +321,8 @@ def uniform(random_state):
     return (bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
+#: Where a simulated episode leaves what is known, its value is moved by this share towards the lowest one around.
+PESSIMISM = 0.3
 #: Points of less weight do not count.
 LEAST_SHARE = 0.02
 
@@ -392,8 +394,8 @@ def simulate(
 
     The λ-return is not cut at actions that are not greedy (Peng's Q(λ): Peng and Williams, Incremental multi-step
     Q-learning, 1996). An update removes the share α of the error of the mean of the neighbours' values, as with
-    ``step_size="normalized"``. An episode ends where it leaves what is known. It is worth the lowest value of the points
-    there: a greedy policy must not lead to where its model has nothing to say.
+    ``step_size="normalized"``. An episode ends where it leaves what is known. There its value is moved towards the
+    lowest one around: a greedy policy should not lead to where its model has nothing to say.
 
     :param values: Q of each point and action, shape (n_rows, n_actions); input and output
     :param planned_values: the same from value iteration
@@ -468,9 +470,11 @@ def simulate(
                 if after == -np.inf:
                     after = values[indices[step + 1, 0]].max()
                 if is_last and leaves:
+                    lowest = after
                     for i in range(k):
                         if weights[step + 1, i] > LEAST_SHARE:
-                            after = min(after, planned_best[indices[step + 1, i]])
+                            lowest = min(lowest, planned_best[indices[step + 1, i]])
+                    after += PESSIMISM * (lowest - after)
                 if not is_last:
                     after += simulation.trace_decay * (returned - after)
             returned = rewards[step] + discounts[step] * after

@@ -21,7 +21,7 @@ from sb3_knntd.policies import KNNPolicy
 #: Number of steps between plans. An episode's end also is a time to plan.
 PLAN_EVERY = 25
 #: An agent explores or exploits until the episode ends, or for this many steps.
-SEGMENT = 1000
+SEGMENT = 200
 #: Before the first plan, a random action is held for up to this many steps.
 LONGEST_RANDOM_HOLD = 5
 #: Values that differ by less than this share are equal.
