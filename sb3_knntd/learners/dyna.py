@@ -162,7 +162,8 @@ class DynaLearner(Learner):
         for env, observation in enumerate(self._observations):
             indices, probabilities = (each[0].numpy() for each in self.perceiver.perceive_one(observation))
             source = self.planner.optimistic if self._explores[env] else table
-            values[env] = probabilities @ source[indices]
+            # With fewer points than neighbours, the missing ones have probability 0.
+            values[env] = probabilities @ source[np.minimum(indices, len(source) - 1)]
         self._columns[:] = pick_best(values, uniforms[:, 1])
         if self._is_box:
             self._vectors[:] = self.policy.columns.points[self._columns]
