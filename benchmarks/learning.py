@@ -39,7 +39,7 @@ class Case(NamedTuple):
     :param n_envs: number of parallel environments
     :param tuned: whether to use the settings of ``zoo_configs/``
     :param algorithm: name of an algorithm of this package
-    :param grows: whether visited observations become points, ``points="grow"``
+    :param settings: arguments of the algorithm besides these
     """
 
     what: str
@@ -49,7 +49,7 @@ class Case(NamedTuple):
     n_envs: int = 1
     tuned: bool = False
     algorithm: str = "knntd"
-    grows: bool = False
+    settings: dict[str, Any] | None = None
 
 
 TABLES = {
@@ -66,15 +66,27 @@ TABLES = {
         Case("tuned", "MountainCarContinuous-v0", 10_000, 94, tuned=True, algorithm="exa"),
     ],
     "grow": [
-        Case(what, env_id, 20_000, algorithm=algorithm, grows=grows)
-        for env_id, algorithm in (
-            ("MountainCar-v0", "knntd"),
-            ("CartPole-v1", "knntd"),
-            ("Acrobot-v1", "knntd"),
-            ("Pendulum-v1", "exa"),
-            ("MountainCarContinuous-v0", "exa"),
+        Case(what, env_id, 20_000, algorithm=algorithm, settings=settings)
+        for env_id, algorithm, n_dims, spacing in (
+            ("MountainCar-v0", "knntd", 2, 0.06),
+            ("CartPole-v1", "knntd", 4, 0.18),
+            ("Acrobot-v1", "knntd", 6, 0.3),
+            ("Pendulum-v1", "exa", 3, 0.12),
+            ("MountainCarContinuous-v0", "exa", 2, 0.06),
         )
-        for what, grows in (("lattice", False), ("points that grow", True))
+        for what, settings in (
+            ("lattice", {}),
+            ("points that grow", {"points": "grow"}),
+            (
+                "and Gaussian weights",
+                {
+                    "points": "grow",
+                    "weights": "gaussian",
+                    "bandwidth": 2 * spacing,
+                    "n_neighbors": 4 * n_dims + 1,
+                },
+            ),
+        )
     ],
     "envs": [
         Case("1 environment", "MountainCar-v0", 200_000),
@@ -105,9 +117,7 @@ def play(case: Case, seed: int) -> float:
     th.set_num_threads(1)
     settings = tuned_settings(case.algorithm, case.env_id) if case.tuned else {}
     venv = make_vec_env(case.env_id, case.n_envs, seed=seed)
-    if case.grows:
-        settings["points"] = "grow"
-    model = ALGORITHMS[case.algorithm].load()(venv, seed=seed, **settings)
+    model = ALGORITHMS[case.algorithm].load()(venv, seed=seed, **settings, **(case.settings or {}))
     model.learn(case.steps)
     evaluation = make_vec_env(case.env_id, 10, seed=10_000 + seed)
     mean, _ = evaluate_policy(model, evaluation, n_eval_episodes=EPISODES, deterministic=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pathlib
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from test_robustness import read_in_threads
 from toy_envs import DriftEnv, GridEnv, PushEnv, RecordingVecEnv, StillEnv
 
 from sb3_knntd import KNNTD, ExA
@@ -432,6 +434,33 @@ def test_a_failure_leaves_points_and_table_as_they_were(monkeypatch: pytest.Monk
     monkeypatch.undo()
     model.learn(100)
     assert len(policy.points) == len(policy.q_table)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_interrupt_while_a_point_comes_waits_until_it_is_there(monkeypatch: pytest.MonkeyPatch, known: bool) -> None:
+    model, real, count = make_model(known=known), GrowingTable.add_rows, itertools.count()
+
+    def add_rows(table: GrowingTable, values: th.Tensor) -> None:
+        if next(count) == 30:
+            signal.raise_signal(signal.SIGINT)
+        real(table, values)
+
+    monkeypatch.setattr(GrowingTable, "add_rows", add_rows)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(300)
+    assert len(model.policy.points) == len(model.policy.q_table)
+    assert least_distance(model.policy) > 0.1
+    model.learn(100)
+    assert th.isfinite(model.policy.q_table).all()
+
+
+@pytest.mark.parametrize("kwargs", LEARNERS.values(), ids=LEARNERS)
+def test_reading_in_other_threads_changes_nothing(kwargs: dict[str, Any]) -> None:
+    alone, read = (make_model(known=False, max_points=80, policy_kwargs=kwargs) for _ in range(2))
+    alone.learn(700)
+    assert read_in_threads(read, 700, 200) >= 200
+    assert th.equal(alone.policy.points, read.policy.points)
+    assert th.equal(alone.policy.q_table, read.policy.q_table)
 
 
 def test_a_step_that_fails_leaves_the_values_as_they_were() -> None:
