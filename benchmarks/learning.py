@@ -1,6 +1,6 @@
 """
-Returns after training, as distributions over seeds: with default settings, with tuned settings, and with many parallel
-environments.
+Returns after training, as distributions over seeds: with default settings, with tuned settings, with points that grow,
+and with many parallel environments.
 
     python -m benchmarks.learning [--seeds 10] [--first-seed 100] [--only TABLE ...] [--json FILE]
 
@@ -39,6 +39,7 @@ class Case(NamedTuple):
     :param n_envs: number of parallel environments
     :param tuned: whether to use the settings of ``zoo_configs/``
     :param algorithm: name of an algorithm of this package
+    :param settings: arguments of the algorithm besides these
     """
 
     what: str
@@ -48,6 +49,7 @@ class Case(NamedTuple):
     n_envs: int = 1
     tuned: bool = False
     algorithm: str = "knntd"
+    settings: dict[str, Any] | None = None
 
 
 TABLES = {
@@ -62,6 +64,29 @@ TABLES = {
         Case("ExA(id)", "MountainCarContinuous-v0", 20_000, algorithm="exa"),
         Case("tuned", "Pendulum-v1", 50_000, -200, tuned=True, algorithm="exa"),
         Case("tuned", "MountainCarContinuous-v0", 10_000, 94, tuned=True, algorithm="exa"),
+    ],
+    "grow": [
+        Case(what, env_id, 20_000, algorithm=algorithm, settings=settings)
+        for env_id, algorithm, n_dims, spacing in (
+            ("MountainCar-v0", "knntd", 2, 0.06),
+            ("CartPole-v1", "knntd", 4, 0.18),
+            ("Acrobot-v1", "knntd", 6, 0.3),
+            ("Pendulum-v1", "exa", 3, 0.12),
+            ("MountainCarContinuous-v0", "exa", 2, 0.06),
+        )
+        for what, settings in (
+            ("lattice", {}),
+            ("points that grow", {"points": "grow"}),
+            (
+                "and Gaussian weights",
+                {
+                    "points": "grow",
+                    "weights": "gaussian",
+                    "bandwidth": 2 * spacing,
+                    "n_neighbors": 4 * n_dims + 1,
+                },
+            ),
+        )
     ],
     "envs": [
         Case("1 environment", "MountainCar-v0", 200_000),
@@ -92,7 +117,7 @@ def play(case: Case, seed: int) -> float:
     th.set_num_threads(1)
     settings = tuned_settings(case.algorithm, case.env_id) if case.tuned else {}
     venv = make_vec_env(case.env_id, case.n_envs, seed=seed)
-    model = ALGORITHMS[case.algorithm].load()(venv, seed=seed, **settings)
+    model = ALGORITHMS[case.algorithm].load()(venv, seed=seed, **settings, **(case.settings or {}))
     model.learn(case.steps)
     evaluation = make_vec_env(case.env_id, 10, seed=10_000 + seed)
     mean, _ = evaluate_policy(model, evaluation, n_eval_episodes=EPISODES, deterministic=True)

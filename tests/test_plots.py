@@ -171,6 +171,21 @@ def test_unvisited_cells_are_masked() -> None:
     assert [text.get_text() for text in axes[0].texts] == ["grey: nothing learned"]
 
 
+def test_points_that_grow_are_drawn(tmp_path: Path) -> None:
+    """Also those beyond the range that was visited when all was scaled, and none before learning."""
+    model = make_model([-1.0, -np.inf], [1.0, np.inf], points="grow", n_neighbors=2)
+    for observation in ([0.2, 3.0], [0.4, 3.0], [0.4, 5.0], [0.9, 4.0]):
+        axes = plot_value_function(model)
+        figure_of(axes[0]).savefig(tmp_path / "map.png")
+        for ax in axes:
+            drawn = np.stack(lines_of(ax)["points"], axis=1)
+            np.testing.assert_array_equal(drawn, model.policy.points.numpy())
+        model.policy.lay_anew(np.array([observation]))
+        model.policy.grow(np.array([observation]))
+    assert axes[0].get_ylim() == (3.0, 5.0)
+    assert not lines_of(plot_value_function(make_model([-1.0, -1.0], [1.0, 1.0]))[0])
+
+
 def test_an_untrained_model_can_be_drawn(tmp_path: Path) -> None:
     axes = plot_value_function(make_model([0, 0], [1, 1]), resolution=10)
     assert images(axes)[0].mask.all()
