@@ -20,6 +20,8 @@ FIT, OUTCOME, FRESH = 2, 1, 0
 LEAST_WEIGHT = 1e-4
 #: Ridge of the slopes, relative to the total weight times the squared bandwidth.
 RIDGE = 1e-4
+#: Number of times that a fit is refined, after which a slope that is well determined has a relative bias of RIDGE³.
+REFINEMENTS = 2
 #: Predictions are limited to the range of the neighbours, widened by this share of it on each side.
 EXTRAPOLATION = 0.5
 
@@ -128,13 +130,19 @@ def _insert(transition, squared, nearest, distances, count):
 @jit
 def _enter_at(point, transition, data, model, config):
     """Insert a transition into the lists of a point, and note which fits have become stale."""
+    action_dim, size = data.actions.shape[1], model.nearest.shape[2]
+    first = data.columns[transition] if action_dim == 0 else 0
+    last = first + 1 if action_dim == 0 else len(config.actions)
+    farthest = 0.0
+    for action in range(first, last):
+        full = model.counts[point, action] == size
+        farthest = max(farthest, model.distances[point, action, size - 1] if full else np.inf)
     squared = 0.0
     for j in range(data.states.shape[1]):
         difference = data.states[transition, j] - model.points[point, j]
         squared += difference * difference
-    action_dim = data.actions.shape[1]
-    first = data.columns[transition] if action_dim == 0 else 0
-    last = first + 1 if action_dim == 0 else len(config.actions)
+        if squared >= farthest:
+            return
     for action in range(first, last):
         total = squared
         for j in range(action_dim):
@@ -206,31 +214,41 @@ def renumber(numbers, model, n_points):
 
 
 @jit
-def solve(matrix, right):
+def factor(matrix):
     """
-    Solve ``matrix @ x = right`` in place by Cholesky's decomposition; the solution is in ``right``.
+    Cholesky's decomposition, in place.
 
-    :param matrix: symmetric and positive definite, shape (n, n); only its lower half is read
-    :param right: shape (n, m)
+    :param matrix: symmetric and positive definite, shape (n, n); only its lower half is read and written
     """
-    n, m = right.shape
+    n = len(matrix)
     for i in range(n):
         for j in range(i + 1):
             rest = matrix[i, j]
             for k in range(j):
                 rest -= matrix[i, k] * matrix[j, k]
             matrix[i, j] = np.sqrt(max(rest, 1e-300)) if i == j else rest / matrix[j, j]
+
+
+@jit
+def solve(factored, right):
+    """
+    Solve a system of linear equations in place.
+
+    :param factored: its matrix, by :func:`factor`, shape (n, n)
+    :param right: right side, and then the solution, shape (n, m)
+    """
+    n, m = right.shape
     for column in range(m):
         for i in range(n):
             rest = right[i, column]
             for k in range(i):
-                rest -= matrix[i, k] * right[k, column]
-            right[i, column] = rest / matrix[i, i]
+                rest -= factored[i, k] * right[k, column]
+            right[i, column] = rest / factored[i, i]
         for i in range(n - 1, -1, -1):
             rest = right[i, column]
             for k in range(i + 1, n):
-                rest -= matrix[k, i] * right[k, column]
-            right[i, column] = rest / matrix[i, i]
+                rest -= factored[k, i] * right[k, column]
+            right[i, column] = rest / factored[i, i]
 
 
 @jit
@@ -292,10 +310,20 @@ def fit(point, action, data, model, config):
                 right[i, j] += weight * inputs[i] * outputs[j]
     model.ends[point, action] = ended / total
     model.end_rewards[point, action] = end_rewards / ended if ended > 0.0 else 0.0
-    matrix[0, 0] += 1e-9 * total
-    for i in range(1, n_inputs):
-        matrix[i, i] += RIDGE * total * bandwidth * bandwidth
+    ridge = np.full(n_inputs, RIDGE * total * bandwidth * bandwidth)
+    ridge[0] = 1e-9 * total
+    for i in range(n_inputs):
+        matrix[i, i] += ridge[i]
+    factor(matrix)
     solve(matrix, right)
+    # Iterated ridge regression: what is well determined loses its bias, what is not stays small.
+    added = right.copy()
+    for _ in range(REFINEMENTS):
+        for i in range(n_inputs):
+            for j in range(obs_dim + 1):
+                added[i, j] *= ridge[i]
+        solve(matrix, added)
+        right += added
     if ended > 0.0:
         mean = rewards / (total - ended) if total > ended else 0.0
         right[:, obs_dim] = 0.0
