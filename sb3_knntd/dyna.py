@@ -21,11 +21,10 @@ from sb3_knntd.common.schedules import make_schedule
 from sb3_knntd.dyna_policies import BANDWIDTH, DynaBoxPolicy, DynaPolicy, policy_for
 from sb3_knntd.kernels.selection import Target
 from sb3_knntd.learners import Learner
-from sb3_knntd.learners.dyna import DynaLearner
+from sb3_knntd.planning import DynaLearner, LocalPlanner, Planner, PlanSettings, StatePlanner
 from sb3_knntd.model import Prediction, TransitionBuffer
 from sb3_knntd.model.rewards import compiled_reward
 from sb3_knntd.perception.growing import Growth
-from sb3_knntd.planning import LocalPlanner, Planner, PlanSettings, StatePlanner
 from sb3_knntd.policies import KNNPolicy
 
 SelfKNNDyna = TypeVar("SelfKNNDyna", bound="KNNDyna")

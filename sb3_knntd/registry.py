@@ -32,7 +32,7 @@ class Algorithm:
     :param entry_point: its class, ``"module:class"``
     :param label: its name in tables and figures
     :param policy: name of its default policy
-    :param action_space: type of the supported action spaces
+    :param action_space: type of the supported action spaces, or several types
     :param role: its role in this package
     :param description: additional text in the help; may be empty
     :param config: file of its tuned hyperparameters in ``zoo_configs/``, in RL Zoo's format; ``None`` if it has none
@@ -45,7 +45,7 @@ class Algorithm:
     entry_point: str
     label: str
     policy: str
-    action_space: type[spaces.Space[Any]]
+    action_space: type[spaces.Space[Any]] | tuple[type[spaces.Space[Any]], ...]
     role: Role
     description: str = ""
     config: str | None = None
@@ -136,6 +136,16 @@ for _algorithm in (
         Role.OWN,
         config="exa.yml",
         search_space="sb3_knntd.zoo.search_space:EXA_SEARCH_SPACE",
+    ),
+    Algorithm(
+        "knndyna",
+        "sb3_knntd.dyna:KNNDyna",
+        "kNN-Dyna",
+        "KNNPolicy",
+        (spaces.Discrete, spaces.Box),
+        Role.OWN,
+        config="dyna.yml",
+        search_space="sb3_knntd.zoo.search_space:DYNA_SEARCH_SPACE",
     ),
     Algorithm(
         "sarsa",

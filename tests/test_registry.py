@@ -68,9 +68,12 @@ def test_every_algorithm_and_every_configuration_is_registered() -> None:
 def test_what_is_registered_is_there_and_fits(algorithm: Algorithm) -> None:
     cls = algorithm.load()
     assert issubclass(cls, BaseAlgorithm)
-    env = "Pendulum-v1" if algorithm.action_space is spaces.Box else "CartPole-v1"
-    assert isinstance(gym.make(env).action_space, algorithm.action_space)
-    cls(algorithm.policy, env)
+    envs = [
+        env for env in ("CartPole-v1", "Pendulum-v1") if isinstance(gym.make(env).action_space, algorithm.action_space)
+    ]
+    assert envs
+    for env in envs:
+        cls(algorithm.policy, env)
     if algorithm.config_path is not None:
         assert yaml.safe_load(algorithm.config_path.read_text(encoding="utf-8"))
     if algorithm.role is Role.OWN:
@@ -84,6 +87,7 @@ def test_compare_offers_what_is_registered(newcomer: str, tmp_path: Path) -> Non
     assert chosen["CartPole-v1", newcomer] == configuration("knntd", "CartPole-v1", False, {})
     assert (label(newcomer), is_own(newcomer)) == ("Newcomer(λ)", True)
     assert (fits(newcomer, "CartPole-v1"), fits(newcomer, "Pendulum-v1")) == (True, False)
+    assert (fits("knndyna", "CartPole-v1"), fits("knndyna", "Pendulum-v1")) == (True, True)
 
 
 def test_rl_zoo_trains_what_is_registered(newcomer: str, tmp_path: Path) -> None:
@@ -96,7 +100,10 @@ def test_rl_zoo_trains_what_is_registered(newcomer: str, tmp_path: Path) -> None
 
 def test_the_help_names_what_is_registered(newcomer: str, capsys: pytest.CaptureFixture[str]) -> None:
     words = help_of("compare", capsys)
-    assert "knntd, exa, sarsa (true online SARSA(λ) with tile coding), newcomer (a new one), and RL Zoo's" in words
+    assert (
+        "knntd, exa, knndyna, sarsa (true online SARSA(λ) with tile coding), newcomer (a new one), and RL Zoo's"
+        in words
+    )
     assert newcomer in help_of("train", capsys)
 
 
@@ -105,7 +112,7 @@ def test_the_demo_takes_the_algorithm_that_fits() -> None:
     assert for_actions(spaces.Box(-1, 1)).name == "exa"
     # One that nothing fits is left to the first to refuse.
     assert for_actions(spaces.MultiBinary(2)).name == "knntd"
-    assert list(with_role(Role.OWN)) == ["knntd", "exa"]
+    assert list(with_role(Role.OWN)) == ["knntd", "exa", "knndyna"]
 
 
 def test_a_mistake_in_registering_is_refused() -> None:

@@ -27,7 +27,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.utils import LinearSchedule
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_knntd import KNNTD, ExA, registry
+from sb3_knntd import KNNTD, ExA, KNNDyna, registry
 from sb3_knntd.cli import main
 from sb3_knntd.common import command_line
 from sb3_knntd.common.command_line import CommandError
@@ -43,7 +43,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:You passed a remote storage"),
 ]
 
-ALGORITHMS = {"knntd": KNNTD, "exa": ExA}
+ALGORITHMS = {"knntd": KNNTD, "exa": ExA, "knndyna": KNNDyna}
 
 
 def search_space(algo: str) -> SearchSpace:
@@ -53,9 +53,13 @@ def search_space(algo: str) -> SearchSpace:
     return space
 
 
-ENVS = {"knntd": "MountainCar-v0", "exa": "Pendulum-v1"}
-#: Points that differ from those of the configurations.
-POINTS = {"knntd": [8, 7], "exa": [5, 4, 3]}
+ENVS = {"knntd": "MountainCar-v0", "exa": "Pendulum-v1", "knndyna": "Pendulum-v1"}
+#: A table that differs from those of the configurations.
+TABLES: dict[str, dict[str, Any]] = {
+    "knntd": {"points": [8, 7], "n_neighbors": 3},
+    "exa": {"points": [5, 4, 3], "n_neighbors": 3},
+    "knndyna": {"spacing": 0.3},
+}
 COMMAND = [sys.executable, "-m", "sb3_knntd.zoo"]
 OPTIMIZE = ["--optimize", "-n", "300", "--n-evaluations", "2", "--eval-episodes", "1", "--no-optim-plots"]
 
@@ -77,14 +81,22 @@ def saved_model(algo: str, run: Path) -> Any:
     return ALGORITHMS[algo].load(path)
 
 
-@pytest.fixture(scope="module", params=["knntd", "exa"])
+def tuned(algo: str, env: str) -> dict[str, Any]:
+    """The configuration of this package."""
+    path = registry.ALGORITHMS[algo].config_path
+    assert path is not None
+    settings: dict[str, Any] = yaml.safe_load(path.read_text())[env]
+    return settings
+
+
+@pytest.fixture(scope="module", params=ALGORITHMS)
 def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """The algorithm, and the folder of a run of 600 steps with other points than the configuration's."""
     algo = request.param
     folder = tmp_path_factory.mktemp("logs")
     options = ["-n", 600, "--eval-freq", 300, "--save-freq", 300, "--tensorboard-log", folder / "tb"]
-    points = f"points:{POINTS[algo]}"
-    return algo, train(folder, algo, ENVS[algo], *options, "--log-interval", 1, "-params", points, "n_neighbors:3")
+    table = [f"{name}:{value}" for name, value in TABLES[algo].items()]
+    return algo, train(folder, algo, ENVS[algo], *options, "--log-interval", 1, "-params", *table)
 
 
 def test_train_stores_model_checkpoints_evaluations_and_settings(trained: tuple[str, Path]) -> None:
@@ -100,9 +112,12 @@ def test_train_stores_model_checkpoints_evaluations_and_settings(trained: tuple[
     assert model.num_timesteps == 600
     assert model.device.type == "cpu"
     # The configuration is found by default, and the command line overrides it.
-    configured = yaml.safe_load((Path(__file__).parent.parent / "zoo_configs" / f"{algo}.yml").read_text())[env]
-    assert (model.gamma, model.bandwidth) == (configured["gamma"], configured["bandwidth"])
-    assert (model.points, model.n_neighbors) == (POINTS[algo], 3)
+    configured = tuned(algo, env)
+    assert len(configured["policy"]) > 0
+    for name in configured.keys() & {"gamma", "bandwidth", "trace_decay"}:
+        assert getattr(model, name) == configured[name]
+    for name, value in TABLES[algo].items():
+        assert getattr(model, name) == value
 
 
 def test_tensorboard_log(trained: tuple[str, Path]) -> None:
@@ -110,7 +125,8 @@ def test_tensorboard_log(trained: tuple[str, Path]) -> None:
     (folder,) = run.parent.parent.glob(f"tb/{ENVS[algo]}/*")
     assert folder.name == f"{ALGORITHMS[algo].__name__}_1"
     log = EventAccumulator(str(folder)).Reload()
-    for key in ("rollout/ep_rew_mean", "eval/mean_reward", "train/td_error"):
+    error = "train/model_error" if algo == "knndyna" else "train/td_error"
+    for key in ("rollout/ep_rew_mean", "eval/mean_reward", error):
         assert np.isfinite([scalar.value for scalar in log.Scalars(key)]).all()
     assert [scalar.step for scalar in log.Scalars("eval/mean_reward")] == [300, 600]
 
@@ -146,6 +162,8 @@ def test_enjoy_loads_what_is_asked_for(
 
 def test_a_seed_given_to_load_determines_exploration(trained: tuple[str, Path]) -> None:
     algo, run = trained
+    if algo == "knndyna":
+        pytest.skip("KNNDyna predicts greedily")
     observation = make_vec_env(ENVS[algo], seed=0).reset()
 
     def explored(seed: int | None) -> list[list[float]]:
@@ -162,8 +180,15 @@ def test_training_continues_from_a_saved_model(trained: tuple[str, Path], tmp_pa
     algo, run = trained
     env = ENVS[algo]
     agent = run / f"{env}.zip"
+    before = saved_model(algo, run)
+    if algo == "knndyna":
+        # It goes on from the transitions that it knows.
+        again = saved_model(algo, train(tmp_path, algo, env, "-n", 100, "--eval-freq", -1, "-i", agent))
+        assert (again.num_timesteps, again.learner.planner.n_transitions) == (100, 700)
+        assert again.spacing == TABLES[algo]["spacing"]
+        return
     frozen = train(tmp_path, algo, env, "-n", 300, "--eval-freq", -1, "-i", agent, "-params", "learning_rate:0.0")
-    before, after = saved_model(algo, run), saved_model(algo, frozen)
+    after = saved_model(algo, frozen)
     assert after.num_timesteps == 300
     # The points of the saved model, not those of the configuration.
     assert after.policy.points.shape == before.policy.points.shape
@@ -172,7 +197,7 @@ def test_training_continues_from_a_saved_model(trained: tuple[str, Path], tmp_pa
     assert not np.array_equal(saved_model(algo, learned).policy.q_table, before.policy.q_table)
 
 
-@pytest.mark.parametrize(("name", "value"), [("points", 4), ("n_neighbors", 2)])
+@pytest.mark.parametrize(("name", "value"), [("points", 4), ("n_neighbors", 2), ("spacing", 0.5)])
 def test_training_cannot_continue_with_another_table(
     trained: tuple[str, Path], name: str, value: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -202,8 +227,9 @@ def test_an_environment_without_configuration_gets_the_defaults(tmp_path: Path) 
     assert model.lr_schedule(0.5) == fresh.lr_schedule(0.5)
 
 
-@pytest.mark.parametrize("algo", ["knntd", "exa"])
+@pytest.mark.parametrize("algo", ALGORITHMS)
 def test_conf_file(algo: str, tmp_path: Path) -> None:
+    table = "spacing" if algo == "knndyna" else "points"
     settings = {
         "n_timesteps": 400,
         "policy": "KNNPolicy",
@@ -214,7 +240,7 @@ def test_conf_file(algo: str, tmp_path: Path) -> None:
         "policy_kwargs": "dict(dtype=th.float32)",
         "learning_rate": "lin_0.8",
         "trace_decay": "lin_0.5_0.9",
-        "points": 6,
+        table: 1,
     }
     conf = tmp_path / "mine.yml"
     conf.write_text(yaml.dump({ENVS[algo]: settings}))
@@ -228,9 +254,9 @@ def test_conf_file(algo: str, tmp_path: Path) -> None:
     zoo("enjoy", "--algo", algo, "--env", ENVS[algo], "-f", tmp_path / "logs", "--no-render", "-n", 5)
 
     python = tmp_path / "mine.py"
-    python.write_text(f"hyperparams = {{{ENVS[algo]!r}: dict(n_timesteps=40, policy='KNNPolicy', points=3)}}")
+    python.write_text(f"hyperparams = {{{ENVS[algo]!r}: dict(n_timesteps=40, policy='KNNPolicy', {table}=3)}}")
     run = train(tmp_path / "logs", algo, ENVS[algo], "--conf-file", python, "--eval-freq", -1)
-    assert saved_model(algo, run).points == 3
+    assert getattr(saved_model(algo, run), table) == 3
 
 
 def test_environments_in_processes(tmp_path: Path) -> None:
@@ -345,6 +371,26 @@ def test_search_space(algo: str, obs_dim: int) -> None:
             assert model.policy.perceiver.points.n_points <= max(30_000, 3**obs_dim)
 
 
+@pytest.mark.parametrize("n_actions", [0, 2])
+@pytest.mark.parametrize("obs_dim", [0, 4])
+def test_search_space_of_dyna(obs_dim: int, n_actions: int) -> None:
+    space, env = search_space("knndyna"), make_env("exa" if n_actions else "knntd", obs_dim)
+    trial = asked(obs_dim, {})
+    space.sample(trial, n_actions, 1, {})
+    assert ("spacing" in trial.params, "action_points" in trial.params) == (obs_dim > 0, n_actions > 0)
+    distributions = trial.distributions.items()
+    for params in (trial.params, *({name: ends(d)[end] for name, d in distributions} for end in (0, 1))):
+        fixed = with_attributes(optuna.trial.FixedTrial(params), obs_dim, {})
+        arguments = space.sample(fixed, n_actions, 1, {})
+        assert arguments == json.loads(json.dumps(space.convert(params)))
+        model = KNNDyna(env=env, **arguments)
+        for name, value in arguments.items():
+            assert getattr(model, name) == value
+    # What a configuration gives in detail is kept.
+    given = {"spacing": 0.1, "action_points": [[-1.0, 1.0]] * 2}
+    assert not given.keys() & space.sample(asked(obs_dim, given), n_actions, 1, {}).keys()
+
+
 @pytest.mark.parametrize("algo", ["knntd", "exa"])
 @pytest.mark.parametrize(("points", "most_neighbors"), [([4, 6], 16), ([2, 3], 6), ([[0.0, 0.0], [1.0, 1.0]], 2)])
 def test_a_study_keeps_the_points_of_each_dimension(algo: str, points: list[Any], most_neighbors: int) -> None:
@@ -358,8 +404,17 @@ def test_a_study_keeps_the_points_of_each_dimension(algo: str, points: list[Any]
     assert {"points"} < search_space(algo).sample(asked(2, {"points": 5, "action_points": 3}), 0, 1, {}).keys()
 
 
-@pytest.mark.parametrize("algo", ["knntd", "exa"])
-@pytest.mark.parametrize("given", [{}, {"points": [5, 6]}])
+@pytest.mark.parametrize(
+    ("algo", "given"),
+    [
+        ("knntd", {}),
+        ("knntd", {"points": [5, 6]}),
+        ("exa", {}),
+        ("exa", {"points": [5, 6]}),
+        ("knndyna", {}),
+        ("knndyna", {"spacing": 0.11}),
+    ],
+)
 def test_the_first_trial_is_the_configurations(algo: str, given: dict[str, Any]) -> None:
     configuration = given | search_space(algo).sample(asked(2, given), 0, 1, {})
     first = ConfigurationFirst(RandomSampler(seed=1), study_values(ALGORITHMS[algo], configuration))
@@ -397,7 +452,7 @@ def test_optimize_exa_and_train_with_a_trial(tmp_path: Path) -> None:
     assert all(trial.value is not None and -2000 < trial.value < 0 for trial in study.trials)
     trial = study.trials[1]
     assert trial.user_attrs[OBS_DIM] == 3
-    settings = yaml.safe_load((Path(__file__).parent.parent / "zoo_configs" / "exa.yml").read_text())["Pendulum-v1"]
+    settings = tuned("exa", "Pendulum-v1")
     assert study.trials[0].params["initial_value_size"] == abs(settings["initial_value"])
     assert study.trials[0].params["bandwidth"] == settings["bandwidth"]
     options = ["-n", 100, "--eval-freq", -1, *study_options, "--trial-id", 1]
@@ -408,6 +463,11 @@ def test_optimize_exa_and_train_with_a_trial(tmp_path: Path) -> None:
     assert model.bandwidth == trial.params["bandwidth"]
     assert model.gamma == 1 - trial.params["one_minus_gamma"] == trial.user_attrs["gamma"]
     assert model.lr_schedule(1.0) == trial.params["initial_learning_rate"]
+
+
+def test_optimize_dyna(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    zoo("train", "--algo", "knndyna", "--env", "Pendulum-v1", "-f", tmp_path, *OPTIMIZE, "--n-trials", 2)
+    assert "Number of finished trials:  2" in capsys.readouterr().out
 
 
 def test_optimize_finite_states_with_other_sampler_and_pruner(

@@ -21,7 +21,7 @@ from sb3_knntd.zoo.search_space import attributes, study_values
 
 #: Arguments that determine the shape of the table. As with a network's architecture, those of the saved model apply
 #: when training continues.
-SHAPE = ("points", "bounds", "n_neighbors", "action_points", "action_table")
+SHAPE = ("points", "spacing", "max_points", "bounds", "n_neighbors", "action_points", "action_table")
 
 #: Number of retries if a database cannot be used, and seconds between them.
 DATABASE_RETRIES = 3

@@ -5,7 +5,8 @@ arguments.
 The values of a study are numbers and strings. Most have a log scale: 1 - γ and 1 - λ instead of γ and λ, the number of
 points per dimension, and the bandwidth in lattice spacings, which makes it independent of the lattice.
 
-If a configuration gives the points per dimension, a study keeps them as prior knowledge; likewise action points.
+If a configuration gives the points per dimension, a study keeps them as prior knowledge; likewise the spacing of points
+that grow, and action points.
 """
 
 from __future__ import annotations
@@ -47,9 +48,15 @@ KEPT_POINTS = "kept_points"
 #: Trial attribute: whether the configuration gives the action points per dimension.
 KEEPS_ACTION_POINTS = "keeps_action_points"
 
+#: Trial attribute: whether the configuration gives the spacing of points that grow.
+KEEPS_SPACING = "keeps_spacing"
+
 #: Approximate largest number of points of a searched lattice, in total and per dimension.
 MOST_POINTS = 20_000
 MOST_POINTS_PER_DIMENSION = 40
+
+#: Searched spacings of points that grow, scaled units.
+SPACINGS = ("auto", 0.04, 0.06, 0.09, 0.13, 0.2, 0.3, 0.45)
 
 
 def sample_knntd_params(
@@ -107,8 +114,40 @@ def convert_exa_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return _convert_common(sampled_params)
 
 
+def sample_dyna_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    :param trial: trial with the user attributes of :func:`attributes`
+    :param n_actions: number of action dimensions, 0 for Discrete actions
+    :param n_envs: not used
+    :param additional_args: not used
+    :return: arguments of :class:`~sb3_knntd.KNNDyna`
+    """
+    params: Params = {
+        "learning_rate": trial.suggest_float("learning_rate", 0.02, 1.0, log=True),
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.0001, 0.1, log=True),
+        "one_minus_trace_decay": trial.suggest_float("one_minus_trace_decay", 0.01, 1.0, log=True),
+        "simulated_steps": trial.suggest_int("simulated_steps", 10, 1000, log=True),
+        "optimism": trial.suggest_float("optimism", 0.0, 10.0),
+    }
+    if trial.user_attrs[OBS_DIM] and not trial.user_attrs[KEEPS_SPACING]:
+        params["spacing"] = trial.suggest_categorical("spacing", SPACINGS)
+    if n_actions and not trial.user_attrs[KEEPS_ACTION_POINTS]:
+        params["action_points"] = trial.suggest_int("action_points", 2, 9)
+    return _arguments(trial, convert_dyna_params(params))
+
+
+def convert_dyna_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: values of a study of :class:`~sb3_knntd.KNNDyna`
+    :return: arguments in the format of a configuration
+    """
+    return _convert_complements(sampled_params)
+
+
 def _sample_common(trial: optuna.Trial) -> Params:
-    """Sample the values of both algorithms, all of them in every trial, as multivariate samplers require."""
+    """Sample what KNNTD and ExA share, all of it in every trial, as multivariate samplers require."""
     params: Params = {
         "initial_learning_rate": trial.suggest_float("initial_learning_rate", 0.05, 1.0, log=True),
         "final_learning_rate_share": trial.suggest_float("final_learning_rate_share", 0.01, 1.0, log=True),
@@ -138,12 +177,17 @@ def _sample_common(trial: optuna.Trial) -> Params:
     return params
 
 
-def _convert_common(sampled_params: Params) -> Params:
+def _convert_complements(sampled_params: Params) -> Params:
     params = dict(sampled_params)
-    learning_rate = params.pop("initial_learning_rate")
-    params["learning_rate"] = f"lin_{learning_rate}_{learning_rate * params.pop('final_learning_rate_share'):.3g}"
     params["gamma"] = 1 - params.pop("one_minus_gamma")
     params["trace_decay"] = 1 - params.pop("one_minus_trace_decay")
+    return params
+
+
+def _convert_common(sampled_params: Params) -> Params:
+    params = _convert_complements(sampled_params)
+    learning_rate = params.pop("initial_learning_rate")
+    params["learning_rate"] = f"lin_{learning_rate}_{learning_rate * params.pop('final_learning_rate_share'):.3g}"
     params["initial_value"] = params.pop("initial_value_sign") * params.pop("initial_value_size")
     if "points_per_dimension" in params:
         params["points"] = params.pop("points_per_dimension")
@@ -168,6 +212,7 @@ def attributes(obs_dim: int, configuration: Mapping[str, Any]) -> dict[str, Any]
         OBS_DIM: obs_dim,
         KEPT_POINTS: n_points,
         KEEPS_ACTION_POINTS: isinstance(configuration.get("action_points"), list),
+        KEEPS_SPACING: not isinstance(configuration.get("spacing", "auto"), str),
     }
 
 
@@ -175,7 +220,7 @@ def study_values(algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any
     """
     Convert arguments to values of a study, the inverse of a converter.
 
-    :param algorithm: :class:`~sb3_knntd.KNNTD` or :class:`~sb3_knntd.ExA`
+    :param algorithm: an algorithm of this package
     :param configuration: arguments of the algorithm, schedules as functions; missing ones have their defaults
     :return: values of a study, and arguments that a study does not search
     """
@@ -192,11 +237,12 @@ def study_values(algorithm: type[BaseAlgorithm], configuration: Mapping[str, Any
     values["one_minus_gamma"] = 1 - values["gamma"]
     if isinstance(values["trace_decay"], float | int):
         values["one_minus_trace_decay"] = 1 - values["trace_decay"]
-    values |= {
-        "initial_value_sign": int(np.sign(values["initial_value"])),
-        "initial_value_size": abs(values["initial_value"]),
-    }
-    if isinstance(values["points"], int):
+    if "initial_value" in values:
+        values |= {
+            "initial_value_sign": int(np.sign(values["initial_value"])),
+            "initial_value_size": abs(values["initial_value"]),
+        }
+    if isinstance(values.get("points"), int):
         values["points_per_dimension"] = values["points"]
         values["bandwidth_in_spacings"] = values["bandwidth"] * (values["points"] - 1) / 2
     if "temperature" in values:
@@ -214,3 +260,4 @@ def _arguments(trial: optuna.Trial, params: Params) -> Params:
 
 KNNTD_SEARCH_SPACE = SearchSpace(sample_knntd_params, convert_knntd_params)
 EXA_SEARCH_SPACE = SearchSpace(sample_exa_params, convert_exa_params)
+DYNA_SEARCH_SPACE = SearchSpace(sample_dyna_params, convert_dyna_params)
