@@ -168,8 +168,15 @@ class KNNDyna(KNNAlgorithm):
 
     def _lay_out(self) -> None:
         """Choose the policy and how it reads its table by the spaces."""
+        fitting = policy_for(self.action_space)
         if self.policy_class is KNNPolicy:
-            self.policy_class = policy_for(self.action_space)
+            self.policy_class = fitting
+        elif not issubclass(self.policy_class, fitting):
+            raise ValueError(
+                f"policy of KNNDyna must be {fitting.__name__} or a subclass where actions are in a "
+                f"{fitting.acts_in.__name__}; got {self.policy_class.__name__}. Call KNNDyna(env), or in SB3's order "
+                'KNNDyna("KNNPolicy", env)'
+            )
         if isinstance(self.observation_space, spaces.Box):
             obs_dim = int(np.prod(self.observation_space.shape))
             growing = Growth(self.spacing, self.max_points).make_points(obs_dim)

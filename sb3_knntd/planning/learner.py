@@ -127,9 +127,7 @@ class DynaLearner(Learner):
             if terminated and env not in last:
                 # Where it ended is not known: that it ended is.
                 next_rows[env] = self._observations[env]
-            self.planner.add(
-                self._observations[env], actions[env], float(rewards[env]), next_rows[env], terminated
-            )
+            self.planner.add(self._observations[env], actions[env], float(rewards[env]), next_rows[env], terminated)
         self._observations[:] = rows
         self._rest -= 1
         for env in np.flatnonzero(ended).tolist():
@@ -161,7 +159,9 @@ class DynaLearner(Learner):
         for env, observation in enumerate(self._observations):
             source = self.planner.optimistic if self._explores[env] else table
             # If the points are fewer than k, places without a point follow them.
-            indices, probabilities = (each[0, : len(source)].numpy() for each in self.perceiver.perceive_one(observation))
+            indices, probabilities = (
+                each[0, : len(source)].numpy() for each in self.perceiver.perceive_one(observation)
+            )
             values[env] = probabilities @ source[indices]
         self._columns[:] = pick_best(values, uniforms[:, 1])
         if self._is_box:
@@ -185,7 +185,9 @@ class DynaLearner(Learner):
             np.asarray(each, dtype=np.float64).reshape(n, -1)
             for each in (transitions.observations, transitions.next_observations)
         )
-        actions = self.scaled_actions(np.asarray(transitions.actions).reshape(n, -1) if self._is_box else transitions.actions)
+        actions = self.scaled_actions(
+            np.asarray(transitions.actions).reshape(n, -1) if self._is_box else transitions.actions
+        )
         is_first = True
         for i in range(n):
             if is_first:
