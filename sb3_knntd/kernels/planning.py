@@ -54,8 +54,12 @@ class PlanConfig(NamedTuple):
     :param move: an action is held until the state has moved this far
     :param most_held: or for this number of steps
     :param far: what lies farther than this from all points is not known
-    :param low: lower end of the range visited, shape (obs_dim,)
-    :param high: upper end of the range visited, shape (obs_dim,)
+    :param low: lower limit of predicted states, shape (obs_dim,)
+    :param high: upper limit of predicted states, shape (obs_dim,)
+    :param offset: observation units of the scaled state -1, shape (obs_dim,)
+    :param unit: observation units of a scaled unit, shape (obs_dim,)
+    :param actions: the action of each column: action units, shape (n_actions, action_dim); Discrete: its number counted
+        from the start of the space, shape (n_actions, 1)
     """
 
     gamma: float
@@ -66,6 +70,15 @@ class PlanConfig(NamedTuple):
     far: float
     low: np.ndarray
     high: np.ndarray
+    offset: np.ndarray
+    unit: np.ndarray
+    actions: np.ndarray
+
+
+@jit
+def learned_reward(observation, action, next_observation):
+    """Stand in for a reward function where the reward is learned: NaN."""
+    return np.nan
 
 
 @jit
@@ -108,46 +121,53 @@ def gaussian_neighbors(state, points, n_points, bandwidth, indices, weights):
 
 
 @jit
-def _advance(state, point, action, model, config, outputs, nothing):
-    """Replace a state by the predicted next one, within the range visited; its squared distance from the old one."""
-    predict(state, point, action, nothing, model, outputs)
-    moved = 0.0
-    for j in range(len(state)):
-        after = min(max(state[j] + outputs[j], config.low[j]), config.high[j])
-        moved += (after - state[j]) ** 2
-        state[j] = after
-    return moved
+def _advance(state, point, action, model, config, reward_function, outputs, places):
+    """
+    Replace a state by the predicted next one, within limits.
+
+    :param places: work space, shape (2, obs_dim)
+    :return: reward, and probability that the next state is terminal
+    """
+    predict(state, point, action, places[0, :0], model, outputs)
+    obs_dim = len(state)
+    for j in range(obs_dim):
+        places[0, j] = config.offset[j] + config.unit[j] * (state[j] + 1.0)
+        state[j] = min(max(state[j] + outputs[j], config.low[j]), config.high[j])
+        places[1, j] = config.offset[j] + config.unit[j] * (state[j] + 1.0)
+    end = model.ends[point, action]
+    reward = reward_function(places[0], config.actions[action], places[1])
+    if np.isnan(reward):
+        reward = (1.0 - end) * outputs[obs_dim] + end * model.end_rewards[point, action]
+    return reward, end
 
 
 @jit
-def _hold(start, action, n_points, model, config, state, outputs, nothing):
+def _hold(start, action, n_points, model, config, reward_function, state, outputs, places):
     """
     Hold an action in the model until the state has moved far enough, or its way leaves what is known.
 
     :return: reward, discount, and whether it is not known how it goes on; ``state`` is where it leads to
     """
-    reward, discount = 0.0, 1.0
+    total, discount, moved = 0.0, 1.0, 0.0
     state[:] = start
-    moved = 0.0
     for _ in range(config.most_held):
         point, _ = nearest_point(state, model.points, n_points)
         if not model.known[point, action]:
             # After half a spacing it is told what the action does.
-            return reward, discount, moved < 0.25 * config.spacing**2
-        _advance(state, point, action, model, config, outputs, nothing)
-        end = model.ends[point, action]
-        reward += discount * ((1.0 - end) * outputs[len(state)] + end * model.end_rewards[point, action])
+            return total, discount, moved < 0.25 * config.spacing**2
+        reward, end = _advance(state, point, action, model, config, reward_function, outputs, places)
+        total += discount * reward
         discount *= config.gamma * (1.0 - end)
         moved = 0.0
         for j in range(len(state)):
             moved += (state[j] - start[j]) ** 2
         if moved > config.move**2 or discount < LEAST_DISCOUNT:
             break
-    return reward, discount, False
+    return total, discount, False
 
 
 @jit
-def make_outcome(point, action, n_points, model, outcomes, config, state, outputs, nothing):
+def make_outcome(point, action, n_points, model, outcomes, config, reward_function, state, outputs, places):
     """
     Find what follows on a point if an action is held.
 
@@ -157,12 +177,14 @@ def make_outcome(point, action, n_points, model, outcomes, config, state, output
     :param model: see :class:`~sb3_knntd.kernels.local_model.ModelArrays`
     :param outcomes: see :class:`OutcomeArrays`
     :param config: see :class:`PlanConfig`
+    :param reward_function: compiled, see :func:`learned_reward`
     :param state: work space, shape (obs_dim,)
     :param outputs: work space, shape (obs_dim + 1,)
-    :param nothing: empty array
+    :param places: work space, shape (2, obs_dim)
     """
+    start = model.points[point]
     reward, discount, unknown = _hold(
-        model.points[point], action, n_points, model, config, state, outputs, nothing
+        start, action, n_points, model, config, reward_function, state, outputs, places
     )
     nearest, farthest = gaussian_neighbors(
         state,
@@ -180,7 +202,7 @@ def make_outcome(point, action, n_points, model, outcomes, config, state, output
 
 
 @jit
-def refresh_outcomes(n_points, n_others, first, model, outcomes, config):
+def refresh_outcomes(n_points, n_others, first, model, outcomes, config, reward_function):
     """
     Find the stale outcomes anew, and those of some points in turn, since the ways to them can have changed as well.
 
@@ -190,20 +212,23 @@ def refresh_outcomes(n_points, n_others, first, model, outcomes, config):
     :param model: see :class:`~sb3_knntd.kernels.local_model.ModelArrays`
     :param outcomes: see :class:`OutcomeArrays`
     :param config: see :class:`PlanConfig`
+    :param reward_function: compiled, see :func:`learned_reward`
     :return: the point to begin with the next time
     """
     obs_dim = model.points.shape[1]
-    state, outputs, nothing = np.empty(obs_dim), np.empty(obs_dim + 1), np.empty(0)
+    state, outputs, places = np.empty(obs_dim), np.empty(obs_dim + 1), np.empty((2, obs_dim))
     n_actions = model.stale.shape[1]
     for point in range(n_points):
         for action in range(n_actions):
             if model.stale[point, action] != FRESH:
-                make_outcome(point, action, n_points, model, outcomes, config, state, outputs, nothing)
+                make_outcome(
+                    point, action, n_points, model, outcomes, config, reward_function, state, outputs, places
+                )
                 model.stale[point, action] = FRESH
     for _ in range(min(n_others, n_points)):
         first = first + 1 if first + 1 < n_points else 0
         for action in range(n_actions):
-            make_outcome(first, action, n_points, model, outcomes, config, state, outputs, nothing)
+            make_outcome(first, action, n_points, model, outcomes, config, reward_function, state, outputs, places)
     return first
 
 
@@ -296,6 +321,12 @@ def uniform(random_state):
     return (bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
+#: Where a simulated episode leaves what is known, its value is moved by this share towards the lowest one around.
+PESSIMISM = 0.3
+#: Points of less weight do not count.
+LEAST_SHARE = 0.02
+
+
 @jit
 def known_value(values, known, indices, weights, action):
     """
@@ -313,7 +344,7 @@ def known_value(values, known, indices, weights, action):
         if known[indices[i], action]:
             total += weights[i] * values[indices[i], action]
             known_weight += weights[i]
-    return total / known_weight if known_weight > 0.05 else -np.inf
+    return total / known_weight if known_weight > LEAST_SHARE else -np.inf
 
 
 class SimulationConfig(NamedTuple):
@@ -343,15 +374,32 @@ class SimulationConfig(NamedTuple):
 
 
 @jit
-def simulate(values, planned_values, n_points, n_transitions, starts, data, model, config, simulation, random_state, k):
+def simulate(
+    values,
+    planned_values,
+    planned_best,
+    n_points,
+    n_transitions,
+    starts,
+    data,
+    model,
+    config,
+    simulation,
+    reward_function,
+    random_state,
+    k,
+):
     """
     Learn from episodes in the model by the λ-return, after each episode, from its last step to its first.
 
-    The λ-return of a step whose next action is not greedy is cut there, as in Watkins's Q(λ). An update removes the
-    share α of the error of the mean of the neighbours' values, as with ``step_size="normalized"``.
+    The λ-return is not cut at actions that are not greedy (Peng's Q(λ): Peng and Williams, Incremental multi-step
+    Q-learning, 1996). An update removes the share α of the error of the mean of the neighbours' values, as with
+    ``step_size="normalized"``. An episode ends where it leaves what is known. There its value is moved towards the
+    lowest one around: a greedy policy should not lead to where its model has nothing to say.
 
     :param values: Q of each point and action, shape (n_rows, n_actions); input and output
     :param planned_values: the same from value iteration
+    :param planned_best: of ``planned_values``, shape (n_rows,)
     :param n_points: number of points
     :param n_transitions: number of transitions
     :param starts: states that episodes began in, shape (n_starts, obs_dim), scaled units
@@ -359,14 +407,14 @@ def simulate(values, planned_values, n_points, n_transitions, starts, data, mode
     :param model: see :class:`~sb3_knntd.kernels.local_model.ModelArrays`
     :param config: see :class:`PlanConfig`
     :param simulation: see :class:`SimulationConfig`
+    :param reward_function: compiled, see :func:`learned_reward`
     :param random_state: shape (1,), uint64
     :param k: number of neighbours with which the table is read
     """
     obs_dim, n_actions, longest = model.points.shape[1], values.shape[1], simulation.longest
     indices, weights = np.empty((longest + 1, k), np.int64), np.empty((longest + 1, k))
-    actions, greedy = np.empty(longest, np.int64), np.empty(longest, np.bool_)
-    rewards, discounts = np.empty(longest), np.empty(longest)
-    state, outputs, nothing = np.empty(obs_dim), np.empty(obs_dim + 1), np.empty(0)
+    actions, rewards, discounts = np.empty(longest, np.int64), np.empty(longest), np.empty(longest)
+    state, outputs, places = np.empty(obs_dim), np.empty(obs_dim + 1), np.empty((2, obs_dim))
     known, used = model.known, 0
     while used < simulation.n_steps:
         if uniform(random_state) < simulation.from_start and len(starts):
@@ -374,7 +422,7 @@ def simulate(values, planned_values, n_points, n_transitions, starts, data, mode
         else:
             state[:] = data.states[int(uniform(random_state) * n_transitions)]
         follows_plan = uniform(random_state) < simulation.planned
-        length, ended = 0, False
+        length, ended, leaves = 0, False, False
         while True:
             nearest, _ = gaussian_neighbors(
                 state, model.points, n_points, config.bandwidth, indices[length], weights[length]
@@ -392,7 +440,8 @@ def simulate(values, planned_values, n_points, n_transitions, starts, data, mode
                     best, highest = action, value
                 if planned_values[point, action] > planned:
                     chosen, planned = action, planned_values[point, action]
-            if length == longest or n_known == 0 or nearest > config.far**2:
+            leaves = n_known == 0 or nearest > config.far**2
+            if length == longest or leaves:
                 break
             if not follows_plan:
                 chosen = best
@@ -403,10 +452,8 @@ def simulate(values, planned_values, n_points, n_transitions, starts, data, mode
                         if place == 0:
                             chosen = action
                         place -= 1
-            actions[length], greedy[length] = chosen, chosen == best
-            _advance(state, point, chosen, model, config, outputs, nothing)
-            end = model.ends[point, chosen]
-            rewards[length] = (1.0 - end) * outputs[obs_dim] + end * model.end_rewards[point, chosen]
+            actions[length] = chosen
+            rewards[length], end = _advance(state, point, chosen, model, config, reward_function, outputs, places)
             discounts[length] = config.gamma * (1.0 - end)
             length += 1
             if end > END:
@@ -422,7 +469,13 @@ def simulate(values, planned_values, n_points, n_transitions, starts, data, mode
                     after = max(after, known_value(values, known, indices[step + 1], weights[step + 1], action))
                 if after == -np.inf:
                     after = values[indices[step + 1, 0]].max()
-                if not is_last and greedy[step + 1]:
+                if is_last and leaves:
+                    lowest = after
+                    for i in range(k):
+                        if weights[step + 1, i] > LEAST_SHARE:
+                            lowest = min(lowest, planned_best[indices[step + 1, i]])
+                    after += PESSIMISM * (lowest - after)
+                if not is_last:
                     after += simulation.trace_decay * (returned - after)
             returned = rewards[step] + discounts[step] * after
             action = actions[step]

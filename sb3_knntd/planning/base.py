@@ -55,6 +55,11 @@ class RewardRange:
         self.numbers[low + 1] = max(self.numbers[low + 1], reward)
 
     @property
+    def differs(self) -> bool:
+        """Whether there is something to choose between: rewards differ, or a step ended an episode."""
+        return bool(self.numbers[0] < self.numbers[1] or self.numbers[3] > -np.inf)
+
+    @property
     def largest(self) -> float:
         """The largest absolute reward, at least a tiny number."""
         finite = self.numbers[np.isfinite(self.numbers)]

@@ -20,8 +20,8 @@ from sb3_knntd.policies import KNNPolicy
 
 #: Number of steps between plans. An episode's end also is a time to plan.
 PLAN_EVERY = 25
-#: An agent explores or exploits for this many steps, or until the episode ends.
-SEGMENT = 500
+#: An agent explores or exploits until the episode ends, or for this many steps.
+SEGMENT = 200
 #: Before the first plan, a random action is held for up to this many steps.
 LONGEST_RANDOM_HOLD = 5
 #: Values that differ by less than this share are equal.
@@ -30,8 +30,9 @@ TIE = 1e-9
 
 class DynaLearner(Learner):
     """
-    Explores by optimistic values in half of the episodes, and by the policy in the others, since a model must be right
-    where the policy goes. Random actions are taken only before the first plan.
+    Explores by optimistic values in half of the episodes, and acts by the policy in the others, since a model must be
+    right where the policy goes. While all rewards have been the same and no episode has ended by itself, it only
+    explores. Random actions are taken only before the first plan.
 
     :param policy: acts, and has the table that is planned on
     :param planner: learns the model and plans
@@ -153,7 +154,7 @@ class DynaLearner(Learner):
             self._select_random(uniforms)
             return
         due = self._rest <= 0
-        self._explores[due] = uniforms[due, 0] < 0.5
+        self._explores[due] = (uniforms[due, 0] < 0.5) | (not self.planner.rewards.differs)
         self._rest[due] = SEGMENT
         table, values = self.table.entries().numpy(), np.empty((self.n_envs, self.table.n_actions))
         for env, observation in enumerate(self._observations):

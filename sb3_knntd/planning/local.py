@@ -62,18 +62,28 @@ class LocalPlanner(Planner):
     :param buffer: the transitions
     :param action_points: see :class:`~sb3_knntd.model.LocalModel`
     :param settings: parameters of planning
+    :param reward_function: compiled, from :func:`~sb3_knntd.model.rewards.compiled_reward`
     """
 
     def __init__(
-        self, policy: KNNPolicy, buffer: TransitionBuffer, action_points: np.ndarray, settings: PlanSettings
+        self,
+        policy: KNNPolicy,
+        buffer: TransitionBuffer,
+        action_points: np.ndarray,
+        settings: PlanSettings,
+        reward_function: Any = kernels.learned_reward,
     ) -> None:
         super().__init__(settings)
+        self._reward_function = reward_function
         points = policy.perceiver.points
         assert isinstance(points, GrowingPoints)
         self.policy, self.points = policy, points
         self.buffer = buffer
         self.model = LocalModel(buffer, action_points)
         self._k, n_actions = policy.n_neighbors, len(action_points)
+        self._actions = policy.columns.points
+        if not self._actions.shape[1]:
+            self._actions = policy.fit_actions(np.arange(n_actions))[:, None].astype(np.float64)
         by_action = (0, n_actions)
         self.outcomes = OutcomeArrays(
             successors=np.zeros((*by_action, self._k), np.int32),
@@ -119,6 +129,8 @@ class LocalPlanner(Planner):
     ) -> None:
         if self.buffer.is_full:
             self.model.make_room()
+        given = self._reward_function(observation, self._in_units(action), next_observation)
+        reward = reward if np.isnan(given) else float(given)
         self.rewards.add(reward, terminated)
         transition = self.buffer.add(observation, action, reward, next_observation, terminated)
         if not self.model.n_points:
@@ -127,6 +139,14 @@ class LocalPlanner(Planner):
         self._compare(transition)
         self.model.enter(transition)
         self._cover(next_observation[None], may_add=not terminated)
+
+    def _in_units(self, action: np.ndarray) -> np.ndarray:
+        """An action as reward functions take it."""
+        if not self.policy.columns.points.shape[1]:
+            in_units: np.ndarray = self._actions[int(action[0])]
+            return in_units
+        low, high = self._actions.min(axis=0), self._actions.max(axis=0)
+        return low + 0.5 * (action + 1.0) * (high - low)
 
     def _compare(self, transition: int) -> None:
         """Record how far a new transition is from what the model expects."""
@@ -210,7 +230,7 @@ class LocalPlanner(Planner):
         if not self.known.any():
             return
         config, arrays = self._plan_config(), self.model.arrays
-        self._turn = kernels.refresh_outcomes(n, TURN, self._turn, arrays, outcomes, config)
+        self._turn = kernels.refresh_outcomes(n, TURN, self._turn, arrays, outcomes, config, self._reward_function)
         somewhere = self.known.any(axis=1)
         tolerance = TOLERANCE * self.rewards.largest
         sweeps = int(np.clip(MOST_READS // outcomes.weights[:n].size, 1, MOST_SWEEPS))
@@ -239,6 +259,7 @@ class LocalPlanner(Planner):
         kernels.simulate(
             values.simulated,
             values.iterated,
+            values.best,
             n,
             buffer.n_transitions,
             starts,
@@ -246,6 +267,7 @@ class LocalPlanner(Planner):
             arrays,
             config,
             simulation,
+            self._reward_function,
             np.array([seed], np.uint64),
             self._k,
         )
@@ -254,6 +276,7 @@ class LocalPlanner(Planner):
 
     def _plan_config(self) -> PlanConfig:
         h, data, n = self.model.spacing, self.model.data, self.buffer.n_transitions
+        bounds = self.policy.perceiver.bounds
         states, next_states = data.states[:n], data.next_states[:n]
         return PlanConfig(
             gamma=self.settings.gamma,
@@ -262,14 +285,20 @@ class LocalPlanner(Planner):
             move=MOVE * h,
             most_held=MOST_HELD,
             far=FAR * h,
-            low=np.minimum(states.min(axis=0), next_states.min(axis=0)),
-            high=np.maximum(states.max(axis=0), next_states.max(axis=0)),
+            # Wide enough for a way out of what was visited to end where nothing is known.
+            low=np.minimum(states.min(axis=0), next_states.min(axis=0)) - 2.0 * FAR * h,
+            high=np.maximum(states.max(axis=0), next_states.max(axis=0)) + 2.0 * FAR * h,
+            offset=bounds.low.numpy(),
+            unit=0.5 * (bounds.high - bounds.low).numpy(),
+            actions=self._actions,
         )
 
     def predict(self, observation: np.ndarray, action: np.ndarray) -> Prediction:
         if not self.model.n_points:
             raise ValueError("the model has learned nothing yet: call learn first")
-        return self.model.predict(observation, action)
+        prediction = self.model.predict(observation, action)
+        reward = self._reward_function(observation, self._in_units(action), prediction.observation)
+        return prediction if np.isnan(reward) else prediction._replace(reward=float(reward))
 
     # ------------------------------------------------------- logging, saving
 
