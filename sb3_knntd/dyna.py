@@ -21,10 +21,10 @@ from sb3_knntd.common.schedules import make_schedule
 from sb3_knntd.dyna_policies import BANDWIDTH, DynaBoxPolicy, DynaPolicy, policy_for
 from sb3_knntd.kernels.selection import Target
 from sb3_knntd.learners import Learner
-from sb3_knntd.planning import DynaLearner, LocalPlanner, Planner, PlanSettings, StatePlanner
 from sb3_knntd.model import Prediction, TransitionBuffer
 from sb3_knntd.model.rewards import compiled_reward
 from sb3_knntd.perception.growing import Growth
+from sb3_knntd.planning import DynaLearner, LocalPlanner, Planner, PlanSettings, StatePlanner
 from sb3_knntd.policies import KNNPolicy
 
 SelfKNNDyna = TypeVar("SelfKNNDyna", bound="KNNDyna")
@@ -248,6 +248,9 @@ class KNNDyna(KNNAlgorithm):
                     last[env] = np.asarray(infos[env]["terminal_observation"])
         self.learner.planner.settings = self._plan_settings()
         self.learner.observe(new_obs, rewards, dones, truncated, last)
+
+    def _lay_anew(self, observations: np.ndarray) -> None:
+        """Nothing: the planner lays the points, for its model and values as well."""
 
     def predict(
         self,

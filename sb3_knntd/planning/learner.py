@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.state_checks import checked_integer, checked_tensor, entry
 from sb3_knntd.common.transitions import check_transition
