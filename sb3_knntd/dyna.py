@@ -21,10 +21,10 @@ from sb3_knntd.common.schedules import make_schedule
 from sb3_knntd.dyna_policies import BANDWIDTH, DynaBoxPolicy, DynaPolicy, policy_for
 from sb3_knntd.kernels.selection import Target
 from sb3_knntd.learners import Learner
-from sb3_knntd.planning import DynaLearner, LocalPlanner, Planner, PlanSettings, StatePlanner
 from sb3_knntd.model import Prediction, TransitionBuffer
 from sb3_knntd.model.rewards import compiled_reward
 from sb3_knntd.perception.growing import Growth
+from sb3_knntd.planning import DynaLearner, LocalPlanner, Planner, PlanSettings, StatePlanner
 from sb3_knntd.policies import KNNPolicy
 
 SelfKNNDyna = TypeVar("SelfKNNDyna", bound="KNNDyna")
@@ -171,8 +171,15 @@ class KNNDyna(KNNAlgorithm):
 
     def _lay_out(self) -> None:
         """Choose the policy and how it reads its table by the spaces."""
+        fitting = policy_for(self.action_space)
         if self.policy_class is KNNPolicy:
-            self.policy_class = policy_for(self.action_space)
+            self.policy_class = fitting
+        elif not issubclass(self.policy_class, fitting):
+            raise ValueError(
+                f"policy of KNNDyna must be {fitting.__name__} or a subclass where actions are in a "
+                f"{fitting.acts_in.__name__}; got {self.policy_class.__name__}. Call KNNDyna(env), or in SB3's order "
+                'KNNDyna("KNNPolicy", env)'
+            )
         if isinstance(self.observation_space, spaces.Box):
             obs_dim = int(np.prod(self.observation_space.shape))
             growing = Growth(self.spacing, self.max_points).make_points(obs_dim)
@@ -241,6 +248,9 @@ class KNNDyna(KNNAlgorithm):
                     last[env] = np.asarray(infos[env]["terminal_observation"])
         self.learner.planner.settings = self._plan_settings()
         self.learner.observe(new_obs, rewards, dones, truncated, last)
+
+    def _lay_anew(self, observations: np.ndarray) -> None:
+        """Nothing: the planner lays the points, for its model and values as well."""
 
     def predict(
         self,

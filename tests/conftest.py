@@ -14,13 +14,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from algorithms import ON_BOX, fitting
 from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from toy_envs import DriftEnv, GridEnv, PushEnv
 
 import sb3_knntd.envs  # noqa: F401  registers the continuous cart-pole
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 
 # All operations are tiny: more threads only slow the tests down, especially under pytest-xdist.
 th.set_num_threads(1)
@@ -35,27 +36,27 @@ def temporary_files(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture
-def algorithm() -> type[KNNTD | ExA]:
+def algorithm() -> type[KNNTD | ExA | KNNDyna]:
     """The algorithm of ``make_model``. Modules that test both algorithms override it."""
     return KNNTD
 
 
 @pytest.fixture
-def env_cls(algorithm: type[KNNTD | ExA]) -> type[DriftEnv]:
+def env_cls(algorithm: type[KNNTD | ExA | KNNDyna]) -> type[DriftEnv]:
     """The drifting point with actions for the algorithm."""
-    return PushEnv if algorithm is ExA else DriftEnv
+    return PushEnv if algorithm in ON_BOX else DriftEnv
 
 
 @pytest.fixture
-def mountain_car(algorithm: type[KNNTD | ExA]) -> str:
+def mountain_car(algorithm: type[KNNTD | ExA | KNNDyna]) -> str:
     """The id of gymnasium's Mountain-Car with actions for the algorithm; it has random initial states."""
-    return "MountainCarContinuous-v0" if algorithm is ExA else "MountainCar-v0"
+    return "MountainCarContinuous-v0" if algorithm in ON_BOX else "MountainCar-v0"
 
 
 @pytest.fixture
-def cart_pole(algorithm: type[KNNTD | ExA]) -> str:
+def cart_pole(algorithm: type[KNNTD | ExA | KNNDyna]) -> str:
     """The id of a cart-pole with actions for the algorithm; two of its observation dimensions are unbounded."""
-    return "sb3_knntd/ContinuousCartPole-v0" if algorithm is ExA else "CartPole-v1"
+    return "sb3_knntd/ContinuousCartPole-v0" if algorithm in ON_BOX else "CartPole-v1"
 
 
 def _number_of_move(action: np.ndarray) -> int:
@@ -63,12 +64,12 @@ def _number_of_move(action: np.ndarray) -> int:
 
 
 @pytest.fixture
-def make_grid(algorithm: type[KNNTD | ExA]) -> Callable[..., gym.Env[Any, Any]]:
+def make_grid(algorithm: type[KNNTD | ExA | KNNDyna]) -> Callable[..., gym.Env[Any, Any]]:
     """A function ``make_grid(kind, **episodes)`` that makes the torus of cells with actions for the algorithm."""
 
     def make(kind: str = "discrete", **episodes: Any) -> gym.Env[Any, Any]:
         env = GridEnv(kind, **episodes)
-        if algorithm is ExA:
+        if algorithm in ON_BOX:
             box = spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
             return gym.wrappers.TransformAction(env, _number_of_move, box)
         return env
@@ -100,10 +101,15 @@ def make_venv(env_cls: type[DriftEnv]) -> Iterator[Callable[..., VecEnv]]:
 
 
 @pytest.fixture
-def make_model(algorithm: type[KNNTD | ExA], make_venv: Callable[..., VecEnv]) -> Callable[..., KNNTD | ExA]:
-    """A function ``make_model(env, **arguments)``: a model with 48 points, by default on a drifting point, seed 0."""
+def make_model(
+    algorithm: type[KNNTD | ExA | KNNDyna], make_venv: Callable[..., VecEnv]
+) -> Callable[..., KNNTD | ExA | KNNDyna]:
+    """
+    A function ``make_model(env, **arguments)``: a model with 48 points, or points that grow, by default on a drifting
+    point, seed 0. Of the arguments, KNNDyna gets those that it has.
+    """
 
-    def make(env: Any = None, **kwargs: Any) -> KNNTD | ExA:
+    def make(env: Any = None, **kwargs: Any) -> KNNTD | ExA | KNNDyna:
         # Given explicitly, so that tests do not depend on defaults, which may change.
         arguments: dict[str, Any] = {
             "points": (8, 6),
@@ -116,7 +122,9 @@ def make_model(algorithm: type[KNNTD | ExA], make_venv: Callable[..., VecEnv]) -
         }
         if algorithm is ExA:
             arguments |= {"action_points": 3, "exploration_hold": 2.0}
-        return algorithm(make_venv() if env is None else env, **{**arguments, **kwargs})
+        if issubclass(algorithm, KNNDyna):
+            arguments |= {"spacing": 0.1, "simulated_steps": 5}
+        return algorithm(make_venv() if env is None else env, **fitting(algorithm, arguments | kwargs))
 
     return make
 

@@ -12,12 +12,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from algorithms import TD_ARGUMENTS, BoxDyna
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from toy_envs import DriftEnv, GridEnv
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, KNNDyna
 
-MakeModel = Callable[..., KNNTD]
+MakeModel = Callable[..., KNNTD | KNNDyna]
+#: For what is the same in all algorithms.
+EACH = pytest.mark.parametrize("algorithm", [KNNTD, KNNDyna])
 
 NAN, INF = float("nan"), float("inf")
 
@@ -52,6 +55,22 @@ REFUSED: dict[str, tuple[list[Any], str]] = {
     "weights": (["uniform", None, 1.0], "'gaussian'"),
     "reset_other_actions": (["yes", None, 1, 0.0], "True or False"),
 }
+#: Those that only KNNDyna has, and those that it does not have.
+REFUSED_BY_DYNA: dict[str, tuple[list[Any], str]] = {
+    "buffer_size": ([99, 0, -5, 1e3, NAN, "many", None, True, 10**400], ">= 100"),
+    "simulated_steps": ([-1, 2.5, NAN, "many", None, True, 10**400], ">= 0"),
+    "optimism": ([-0.1, NAN, INF, "much", None, True, [1.0]], "[0, inf)"),
+    "reward_function": ([5, "mine", 0.5, True, [abs]], "(observation, action, next_observation)"),
+}
+NOT_OF_DYNA = {
+    *TD_ARGUMENTS, "bandwidth", "exploration", "reset_other_actions", "search", "step_size", "target", "traces", "weights"
+}  # fmt: skip
+CASES = [
+    *((KNNTD, argument, values) for argument, values in REFUSED.items()),
+    *((KNNDyna, argument, REFUSED[argument]) for argument in REFUSED.keys() - NOT_OF_DYNA),
+    *((KNNDyna, argument, values) for argument, values in REFUSED_BY_DYNA.items()),
+    (BoxDyna, "action_points", ([1, 0, -2, 2.5, NAN, "many", None, [[1.0, -1.0]], [[0.0, 5.0]]], "action_points")),
+]
 
 
 def message_of(make: Callable[[], Any]) -> str:
@@ -61,10 +80,10 @@ def message_of(make: Callable[[], Any]) -> str:
 
 
 @pytest.mark.parametrize(
-    ("argument", "value", "fits"),
+    ("algorithm", "argument", "value", "fits"),
     [
-        pytest.param(argument, value, fits, id=f"{argument}-{index}")
-        for argument, (values, fits) in REFUSED.items()
+        pytest.param(algorithm, argument, value, fits, id=f"{algorithm.__name__}-{argument}-{index}")
+        for algorithm, argument, (values, fits) in sorted(CASES, key=lambda case: (case[0].__name__, case[1]))
         for index, value in enumerate(values)
     ],
 )
@@ -154,6 +173,7 @@ def test_points(make_model: MakeModel, points: Any, says: str) -> None:
     assert says in message
 
 
+@EACH
 @pytest.mark.parametrize(
     ("bounds", "says"),
     [
@@ -252,6 +272,7 @@ def test_two_environments_are_refused() -> None:
     assert "CartPole-v1" in message
 
 
+@EACH
 @pytest.mark.parametrize(
     ("kwargs", "says"),
     [
@@ -270,6 +291,7 @@ def test_policy_kwargs(make_model: MakeModel, kwargs: dict[str, Any], says: str)
     assert says in message
 
 
+@EACH
 @pytest.mark.parametrize("total_timesteps", [NAN, INF, "1000", b"5", None, True, [100]])
 def test_total_timesteps_must_be_a_number(make_model: MakeModel, total_timesteps: Any) -> None:
     model = make_model()
@@ -279,6 +301,7 @@ def test_total_timesteps_must_be_a_number(make_model: MakeModel, total_timesteps
     assert model.num_timesteps == 0
 
 
+@EACH
 @pytest.mark.parametrize(("total_timesteps", "steps"), [(1e2, 100), (np.int64(7), 7), (12.5, 13), (0, 0), (-4, 0)])
 def test_total_timesteps_are_as_in_stable_baselines3(make_model: MakeModel, total_timesteps: Any, steps: int) -> None:
     """The remaining steps of a finished training are 0 or slightly negative, as in SB3."""
@@ -344,12 +367,14 @@ def faulty_venv(n_envs: int, faulty: int, **fault: Any) -> VecEnv:
     return DummyVecEnv([make(index) for index in range(n_envs)])
 
 
+@EACH
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
 @pytest.mark.parametrize("component", [0, 1, None])
 @pytest.mark.parametrize(("n_envs", "faulty"), [(1, 0), (3, 2)])
 # Episodes have 9, 14 and 6 steps: in the middle of one, at a termination, at a truncation.
 @pytest.mark.parametrize("fault_at", [1, 20, 9, 23])
 def test_fault_is_located_and_leaves_the_model_unchanged(
+    algorithm: type[KNNTD | KNNDyna],
     make_model: MakeModel,
     tmp_path: pathlib.Path,
     n_envs: int,
@@ -381,7 +406,7 @@ def test_fault_is_located_and_leaves_the_model_unchanged(
     assert th.equal(model.policy.q_table, tables[-1])
     assert model.num_timesteps == (fault_at - 1) * n_envs
     model.save(tmp_path / "model")
-    loaded = KNNTD.load(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
     assert th.equal(loaded.policy.q_table, tables[-1])
     assert model.action_space.contains(model.predict(np.zeros(2, dtype=np.float32))[0])
     model.learn(20 * n_envs, reset_num_timesteps=False)
@@ -405,6 +430,7 @@ class FaultyReset(gym.Wrapper[Any, Any, Any, Any]):
         return observation, info
 
 
+@EACH
 @pytest.mark.parametrize("episode", [0, 1, 2])
 def test_fault_in_a_first_observation(make_model: MakeModel, episode: int) -> None:
     model = make_model(FaultyReset(DriftEnv(), episode))

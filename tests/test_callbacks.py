@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from algorithms import ALGORITHMS
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -24,14 +25,14 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 
-Algorithm = type[KNNTD | ExA]
-MakeModel = Callable[..., KNNTD | ExA]
+Algorithm = type[KNNTD | ExA | KNNDyna]
+MakeModel = Callable[..., KNNTD | ExA | KNNDyna]
 MakeVenv = Callable[..., VecEnv]
 
 
-@pytest.fixture(params=[KNNTD, ExA])
+@pytest.fixture(params=ALGORITHMS)
 def algorithm(request: pytest.FixtureRequest) -> Algorithm:
     chosen: Algorithm = request.param
     return chosen
@@ -94,10 +95,10 @@ def test_returning_false_stops_after_that_step(make_model: MakeModel, make_venv:
 
 
 def test_step_is_learned_from_before_the_callback(make_model: MakeModel) -> None:
-    # Without exploration the result does not depend on the requested length of the run.
-    stopped = make_model(exploration_initial_eps=0.0).learn(600, callback=Witness(stop_at=17))
+    # Without exploration the result does not depend on the requested length of the run. KNNDyna plans at step 50.
+    stopped = make_model(exploration_initial_eps=0.0).learn(600, callback=Witness(stop_at=50))
     assert stopped.policy.q_table.any()
-    assert th.equal(stopped.policy.q_table, make_model(exploration_initial_eps=0.0).learn(17).policy.q_table)
+    assert th.equal(stopped.policy.q_table, make_model(exploration_initial_eps=0.0).learn(50).policy.q_table)
 
 
 def test_plain_function(make_model: MakeModel) -> None:
@@ -134,7 +135,8 @@ def test_evaluation(
     assert results["timesteps"].tolist() == [50 * n_envs, 100 * n_envs]
     assert results["results"].shape == (2, 6)
     best = algorithm.load(tmp_path / "best_model")
-    assert best.policy.q_table.shape == model.policy.q_table.shape
+    assert best.policy.q_table.shape[1] == model.policy.q_table.shape[1]
+    assert best.num_timesteps in results["timesteps"]
     assert callback.best_mean_reward == pytest.approx(results["results"].mean(axis=1).max())
 
 

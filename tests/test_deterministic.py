@@ -9,20 +9,21 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from algorithms import ALGORITHMS, TD_ONLY, BoxDyna, fitting
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 from sb3_knntd.common.random_stream import RandomStream
 
-Algorithm = type[KNNTD | ExA]
-MakeModel = Callable[..., KNNTD | ExA]
+Algorithm = type[KNNTD | ExA | KNNDyna]
+MakeModel = Callable[..., KNNTD | ExA | KNNDyna]
 MakeVenv = Callable[..., VecEnv]
 
 
-@pytest.fixture(params=[KNNTD, ExA])
+@pytest.fixture(params=ALGORITHMS)
 def algorithm(request: pytest.FixtureRequest) -> Algorithm:
     chosen: Algorithm = request.param
     return chosen
@@ -37,6 +38,8 @@ CHANCE = [
     pytest.param(ExA, EXPLORING, id="ExA-shared"),
     pytest.param(ExA, {**EXPLORING, "exploration": "per_neighbor"}, id="ExA-per neighbor"),
     pytest.param(ExA, GREEDY, id="ExA-random ties"),
+    pytest.param(KNNDyna, {}, id="KNNDyna"),
+    pytest.param(BoxDyna, {}, id="KNNDyna-Box"),
 ]
 
 
@@ -54,7 +57,8 @@ def test_environments_are_seeded(algorithm: Algorithm, mountain_car: str, n_envs
     def learn(seed: int) -> th.Tensor:
         venv = make_vec_env(lambda: gym.make(mountain_car, max_episode_steps=25), n_envs)
         # Only the initial states are random.
-        model = algorithm(venv, points=8, n_neighbors=4, exploration_initial_eps=0.0, tie_break="first", seed=seed)
+        arguments = {"points": 8, "n_neighbors": 4, "exploration_initial_eps": 0.0, "tie_break": "first", "seed": seed}
+        model = algorithm(venv, **fitting(algorithm, arguments))
         return model.learn(120).policy.q_table
 
     assert th.equal(learn(1), learn(1))
@@ -98,6 +102,7 @@ def test_the_vec_env_class_does_not_matter(make_model: MakeModel, make_venv: Mak
     th.testing.assert_close(dummy.policy.q_table, subproc.policy.q_table, rtol=1e-5, atol=1e-5)
 
 
+@TD_ONLY
 def test_tie_break_first_without_exploration_is_deterministic(make_model: MakeModel) -> None:
     settings = {"exploration_initial_eps": 0.0, "tie_break": "first"}
     first, second = (make_model(seed=seed, **settings).learn(150) for seed in (1, 2))

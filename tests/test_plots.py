@@ -16,15 +16,19 @@ import torch as th
 from gymnasium import spaces
 from matplotlib.axes import Axes
 from sb3_knntd.callbacks import EpisodeVideoCallback, ValueMapCallback
+from toy_envs import DriftEnv, GridEnv, PushEnv
 
-from sb3_knntd import KNNTD
+from sb3_knntd import KNNTD, KNNDyna
 from sb3_knntd.plots import (
     NAMES,
     Names,
     figure_of,
     new_figure,
     plot_learning_curve,
+    plot_model_points,
+    plot_rollout,
     plot_value_function,
+    roll_out,
     running_median,
     telling_dims,
     value_grid,
@@ -337,3 +341,121 @@ def test_without_pillow_a_video_says_what_to_install(tmp_path: Path, monkeypatch
     with pytest.raises(ImportError, match=r'Pillow: pip install "sb3-knntd\[extra\]"'):
         model.learn(10, callback=EpisodeVideoCallback(watched, folder=tmp_path))
     assert model.num_timesteps == 0
+
+
+# ------------------------------------------------------------- points and rollouts
+
+
+class Corridor(gym.Env[np.ndarray, int]):
+    """From 0 to the right by 0.1 a step, or to the left; the episode ends at 1."""
+
+    observation_space = spaces.Box(-1.0, 1.2, (1,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.x, self.n_steps = 0.0, 0
+        return np.float32([self.x]), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.x = max(self.x + (0.1 if action else -0.1), -1.0)
+        self.n_steps += 1
+        return np.float32([self.x]), -1.0, self.x >= 1.0, self.n_steps == 30, {}
+
+
+@pytest.fixture(scope="module")
+def corridor_model() -> KNNDyna:
+    return KNNDyna(Corridor(), spacing=0.05, simulated_steps=5, seed=0).learn(400)
+
+
+def test_points_are_drawn_with_the_number_of_actions_that_are_known() -> None:
+    model = KNNDyna(DriftEnv(), spacing=0.1, simulated_steps=5, seed=0).learn(150)
+    axes = plot_model_points(model, dims=(1, 0))
+    (drawn,) = axes.collections
+    np.testing.assert_array_equal(np.asarray(drawn.get_offsets()), model.policy.points.numpy()[:, ::-1])
+    known = model.learner.planner.known
+    assert 0 < known.sum() < known.size
+    np.testing.assert_array_equal(np.asarray(drawn.get_array()), known.sum(axis=1))
+    (dots,) = axes.lines
+    assert len(np.asarray(dots.get_xdata())) == 150
+    assert axes.get_title() == f"{len(known)} points, 150 transitions"
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("observation[1]", "observation[0]")
+    # Another algorithm knows the entries that it has updated.
+    grown = KNNTD(DriftEnv(), points="grow", spacing=0.1, seed=0).learn(150)
+    (drawn,) = plot_model_points(grown, names=Names(("x", "v"), ("l", "n", "r"))).collections
+    np.testing.assert_array_equal(np.asarray(drawn.get_array()), (grown.policy.q_table != 0).sum(dim=1).numpy())
+
+
+@pytest.mark.parametrize("dims", [(0, 0), (0, 2), (-1, 0), "xy"])
+def test_points_are_drawn_over_two_dimensions(dims: Any) -> None:
+    with pytest.raises(ValueError, match="dims must be two different dimensions"):
+        plot_model_points(KNNDyna(DriftEnv()), dims)
+
+
+def test_points_of_states_and_of_one_dimension_are_not_drawn(corridor_model: KNNDyna) -> None:
+    for model in (corridor_model, KNNDyna(GridEnv())):
+        with pytest.raises(ValueError, match="observations must be a Box of 2 or more dimensions; got"):
+            plot_model_points(model)
+
+
+def test_a_rollout_follows_the_model(corridor_model: KNNDyna) -> None:
+    right = roll_out(corridor_model, np.float32([0.0]), np.ones(5, np.int64))
+    np.testing.assert_allclose(right.observations[:, 0], np.arange(6) / 10, atol=0.01)
+    np.testing.assert_allclose(right.rewards, -1.0, atol=1e-6)
+    assert right.known.all()
+    left = roll_out(corridor_model, np.float32([0.0]), np.zeros(5, np.int64))
+    np.testing.assert_allclose(left.observations[:, 0], -np.arange(6) / 10, atol=0.01)
+    # It ends where the episode does.
+    long = roll_out(corridor_model, np.float32([0.0]), np.ones(50, np.int64))
+    assert 8 <= len(long.rewards) <= 11
+    assert len(long.observations) == len(long.rewards) + 1
+
+
+def test_a_rollout_is_drawn_beside_the_real_episode() -> None:
+    model = KNNDyna(PushEnv(), spacing=0.1, simulated_steps=5, seed=0).learn(150)
+    env = PushEnv(lengths=[100])
+    observations, actions, rewards = [env.reset()[0]], [], []
+    for number in range(20):
+        actions.append(np.array([np.sin(number)]))
+        observation, reward, *_ = env.step(actions[-1])
+        observations.append(observation)
+        rewards.append(reward)
+    expected = roll_out(model, observations[0], np.array(actions))
+    places = plot_rollout(model, np.array(observations), np.array(actions), rewards)
+    assert [ax.get_ylabel() for ax in places] == ["observation[0]", "observation[1]", "reward"]
+    for dim, ax in enumerate(places[:2]):
+        lines = lines_of(ax)
+        np.testing.assert_array_equal(lines["environment"], (np.arange(21), np.array(observations)[:, dim]))
+        n_steps = len(expected.rewards)
+        np.testing.assert_array_equal(lines["model"], (np.arange(n_steps + 1), expected.observations[:, dim]))
+    lines = lines_of(places[2])
+    np.testing.assert_array_equal(lines["environment"], (np.arange(1, 21), rewards))
+    np.testing.assert_array_equal(lines["model"], (np.arange(1, n_steps + 1), expected.rewards))
+    # Far away nothing is known.
+    places = plot_rollout(model, np.array(observations) + 2.0, np.array(actions))
+    assert len(places) == 2
+    assert lines_of(places[0])["model, not known"][0][0] == 1
+
+
+def test_a_rollout_that_does_not_fit(corridor_model: KNNDyna) -> None:
+    line, ones = np.zeros((6, 1)), np.ones(5, np.int64)
+    for arguments, says in (
+        ((line[1:], ones), r"observations must have shape \(n_steps \+ 1, 1\), here \(6, 1\)"),
+        ((line, ones, [0.0]), r"rewards must have shape \(5,\)"),
+        ((line, ones, None, []), "axes must be 1, one for each of observation"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            plot_rollout(corridor_model, *arguments)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="model must be a KNNDyna, which has a model of its environment; got a KNNTD"):
+        plot_rollout(make_model([0], [1]), line, ones)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="learned nothing"):
+        plot_rollout(KNNDyna(Corridor()), line, ones)
+
+
+def test_the_greedy_action_between_action_points_is_drawn() -> None:
+    model = KNNDyna(PushEnv(), spacing=0.1, simulated_steps=5, seed=0).learn(150)
+    grid = value_grid(model, resolution=5)
+    across, up = np.meshgrid(*(np.linspace(a, b, 11)[1::2] for a, b in (grid.extent[:2], grid.extent[2:])))
+    places = np.stack([across, up], axis=2).reshape(-1, 2)
+    np.testing.assert_allclose(grid.actions.reshape(-1, 1), model.predict(places)[0], rtol=1e-6)
+    assert not np.isin(grid.actions, [-1.0, 0.0, 1.0]).all()

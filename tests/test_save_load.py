@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from algorithms import ALGORITHMS, TD_ONLY, fitting
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -23,15 +24,15 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from toy_envs import DriftEnv, GridEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 
-Algorithm = type[KNNTD | ExA]
+Algorithm = type[KNNTD | ExA | KNNDyna]
 MakeGrid = Callable[..., gym.Env[Any, Any]]
-MakeModel = Callable[..., KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA | KNNDyna]
 MakeVenv = Callable[..., VecEnv]
 
 
-@pytest.fixture(params=[KNNTD, ExA])
+@pytest.fixture(params=ALGORITHMS)
 def algorithm(request: pytest.FixtureRequest) -> Algorithm:
     chosen: Algorithm = request.param
     return chosen
@@ -70,11 +71,11 @@ MODELS = pytest.mark.parametrize(
 )
 
 
-def same_table(first: KNNTD | ExA, second: KNNTD | ExA) -> bool:
+def same_table(first: KNNTD | ExA | KNNDyna, second: KNNTD | ExA | KNNDyna) -> bool:
     return th.equal(first.policy.q_table, second.policy.q_table)
 
 
-def go_on(algorithm: Algorithm, path: pathlib.Path, venv: VecEnv, n_steps: int) -> KNNTD | ExA:
+def go_on(algorithm: Algorithm, path: pathlib.Path, venv: VecEnv, n_steps: int) -> KNNTD | ExA | KNNDyna:
     """Load, and continue in an environment that is still in the state it was in."""
     return algorithm.load(path, env=venv, force_reset=False).learn(n_steps, reset_num_timesteps=False)
 

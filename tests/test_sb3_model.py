@@ -10,19 +10,21 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from algorithms import ALGORITHMS, ON_BOX, TD_ONLY, fitting
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from toy_envs import DriftEnv, PushEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
+from sb3_knntd.dyna_policies import DynaBoxPolicy
 from sb3_knntd.policies import ExAPolicy, KNNPolicy
 
-Algorithm = type[KNNTD | ExA]
-MakeModel = Callable[..., KNNTD | ExA]
+Algorithm = type[KNNTD | ExA | KNNDyna]
+MakeModel = Callable[..., KNNTD | ExA | KNNDyna]
 MakeVenv = Callable[..., VecEnv]
 
 
-@pytest.fixture(params=[KNNTD, ExA])
+@pytest.fixture(params=ALGORITHMS)
 def algorithm(request: pytest.FixtureRequest) -> Algorithm:
     chosen: Algorithm = request.param
     return chosen
@@ -43,6 +45,10 @@ def message_of(make: Callable[[], Any]) -> str:
         (lambda: ExA(KNNPolicy, PushEnv()), ["ExAPolicy", "got KNNPolicy", "ExA(env)", 'ExA("KNNPolicy", env)']),
         (lambda: KNNTD(ExAPolicy, DriftEnv()), ["KNNPolicy", "Discrete", "got ExAPolicy", "KNNTD(env)"]),
         (lambda: ExA("ExAPolicy", PushEnv()), ["'ExAPolicy'", "named 'KNNPolicy'", "ExA(env)"]),
+        (lambda: KNNDyna(KNNPolicy), ["env must be given", "KNNDyna(env)"]),
+        (lambda: KNNDyna(ExAPolicy, PushEnv()), ["DynaBoxPolicy", "got ExAPolicy", 'KNNDyna("KNNPolicy", env)']),
+        (lambda: KNNDyna(DynaBoxPolicy, DriftEnv()), ["DynaPolicy", "Discrete", "got DynaBoxPolicy"]),
+        (lambda: KNNDyna("DynaPolicy", DriftEnv()), ["'DynaPolicy'", "named 'KNNPolicy'", "KNNDyna(env)"]),
         (lambda: KNNTD(DriftEnv), ["class DriftEnv", "KNNTD(DriftEnv(...))"]),
         (lambda: KNNTD("KNNPolicy", DriftEnv), ["class DriftEnv", "KNNTD(DriftEnv(...))"]),
         (lambda: ExA(env=PushEnv), ["class PushEnv", "ExA(PushEnv(...))"]),
@@ -74,7 +80,11 @@ def test_user_defined_policies_are_accepted() -> None:
     class OursToo(ExAPolicy):
         pass
 
+    class Planned(DynaBoxPolicy):
+        pass
+
     assert type(KNNTD(Ours, DriftEnv()).policy) is Ours
+    assert type(KNNDyna(Planned, PushEnv()).policy) is Planned
     assert type(ExA(OursToo, PushEnv()).policy) is OursToo
 
 
@@ -105,7 +115,7 @@ class Switches(gym.Env[Any, Any]):
 
 
 def as_box(env: gym.Env[Any, Any], algorithm: Algorithm) -> gym.Env[Any, Any]:
-    if algorithm is KNNTD:
+    if algorithm not in ON_BOX:
         return env
     n = env.unwrapped.n  # type: ignore[attr-defined]
     box = spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
@@ -114,7 +124,7 @@ def as_box(env: gym.Env[Any, Any], algorithm: Algorithm) -> gym.Env[Any, Any]:
 
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_bits_are_a_table(algorithm: Algorithm, n_envs: int) -> None:
-    def learned(binary: bool) -> KNNTD | ExA:
+    def learned(binary: bool) -> KNNTD | ExA | KNNDyna:
         venv = DummyVecEnv([lambda: as_box(Switches(binary=binary), algorithm)] * n_envs)
         return algorithm(venv, seed=0).learn(1_500)
 
@@ -162,13 +172,19 @@ class MineToo(ExA):
     """Another user-defined subclass."""
 
 
-@pytest.mark.parametrize(("base", "sub", "other"), [(KNNTD, Mine, ExA), (ExA, MineToo, KNNTD)])
+class MineAsWell(KNNDyna):
+    """A third user-defined subclass."""
+
+
+@pytest.mark.parametrize(
+    ("base", "sub", "other"), [(KNNTD, Mine, ExA), (ExA, MineToo, KNNTD), (KNNDyna, MineAsWell, KNNTD)]
+)
 def test_subclasses_and_their_base_read_each_others_files(
     base: Algorithm, sub: Algorithm, other: Algorithm, tmp_path: pathlib.Path
 ) -> None:
     env = PushEnv() if base is ExA else DriftEnv()
     for writer, reader in ((sub, base), (base, sub), (sub, sub)):
-        model = writer(env, points=(5, 5), seed=0).learn(200)
+        model = writer(env, **fitting(base, {"points": (5, 5), "seed": 0})).learn(200)
         model.save(tmp_path / "model")
         loaded = reader.load(tmp_path / "model")
         assert type(loaded) is reader
@@ -177,6 +193,7 @@ def test_subclasses_and_their_base_read_each_others_files(
             other.load(tmp_path / "model")
 
 
+@TD_ONLY
 def test_a_policy_with_a_function_is_saved_and_read(
     make_model: MakeModel, observations: np.ndarray, tmp_path: pathlib.Path
 ) -> None:
@@ -192,6 +209,7 @@ def test_a_policy_with_a_function_is_saved_and_read(
 # ------------------------------------------------------------- the policy's values
 
 
+@TD_ONLY
 @pytest.mark.parametrize("table", ["dense", "hashed"])
 @pytest.mark.parametrize("dtype", [th.float64, th.float32])
 def test_the_table_as_a_vector_and_back(make_model: MakeModel, table: str, dtype: th.dtype) -> None:
@@ -289,4 +307,4 @@ def test_a_model_of_normalised_observations_needs_them(
     # A separately saved policy is equal to that of the model.
     loaded.policy.save(tmp_path / "policy")  # type: ignore[arg-type]
     policy = type(loaded.policy).load(tmp_path / "policy")  # type: ignore[arg-type]
-    assert th.equal(policy.points, model.policy.points)
+    assert th.equal(policy.points, loaded.policy.points)

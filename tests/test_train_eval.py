@@ -11,21 +11,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from algorithms import ALGORITHMS, TD_ONLY, fitting
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from toy_envs import DriftEnv, GridEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 
-Algorithm = type[KNNTD | ExA]
+Algorithm = type[KNNTD | ExA | KNNDyna]
 MakeGrid = Callable[..., gym.Env[Any, Any]]
-MakeModel = Callable[..., KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA | KNNDyna]
 MakeVenv = Callable[..., VecEnv]
 
 
-@pytest.fixture(params=[KNNTD, ExA])
+@pytest.fixture(params=ALGORITHMS)
 def algorithm(request: pytest.FixtureRequest) -> Algorithm:
     chosen: Algorithm = request.param
     return chosen
@@ -41,7 +42,7 @@ def test_every_way_of_calling_is_the_same(algorithm: Algorithm, mountain_car: st
     def env() -> gym.Env[Any, Any]:
         return gym.make(env_id)
 
-    calls: list[Callable[..., KNNTD | ExA]] = [
+    calls: list[Callable[..., KNNTD | ExA | KNNDyna]] = [
         lambda **kw: algorithm(env_id, **kw),
         lambda **kw: algorithm("KNNPolicy", env(), **kw),
         lambda **kw: algorithm("KNNPolicy", env_id, **kw),
@@ -52,11 +53,13 @@ def test_every_way_of_calling_is_the_same(algorithm: Algorithm, mountain_car: st
         lambda **kw: algorithm(env(), **kw),
         lambda **kw: algorithm(DummyVecEnv([env]), **kw),
     ]
-    models = [call(seed=0, points=8, n_neighbors=4).learn(100) for call in calls]
+    arguments = fitting(algorithm, {"seed": 0, "points": 8, "n_neighbors": 4})
+    models = [call(**arguments).learn(100) for call in calls]
     assert isinstance(models[0], BaseAlgorithm)
+    assert isinstance(models[0].policy, policy_class)
     assert models[0].policy.q_table.any()
     for model in models[1:]:
-        assert type(model.policy) is policy_class
+        assert type(model.policy) is type(models[0].policy)
         assert th.equal(model.policy.q_table, models[0].policy.q_table)
 
 
@@ -90,6 +93,7 @@ def test_learn_returns_the_model(make_model: MakeModel) -> None:
     assert model.learn(10) is model
 
 
+@TD_ONLY
 def test_initial_value(make_model: MakeModel) -> None:
     assert (make_model(initial_value=-3.5).policy.q_table == -3.5).all()
 
@@ -113,6 +117,7 @@ def test_continued_learning_stays_in_the_episode(make_model: MakeModel) -> None:
     assert [info["l"] for info in model.ep_info_buffer or ()] == [9]
 
 
+@TD_ONLY
 def test_new_learning_resets_the_count_and_episodes_but_not_the_table(make_model: MakeModel) -> None:
     model = make_model(learning_rate=0.0, initial_value=2.0).learn(4)
     model.policy.q_table[0, 0] = 5.0
@@ -122,6 +127,7 @@ def test_new_learning_resets_the_count_and_episodes_but_not_the_table(make_model
     assert model.policy.q_table[0, 0] == 5.0
 
 
+@TD_ONLY
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_traces_do_not_outlive_a_reset(algorithm: Algorithm, make_grid: MakeGrid, n_envs: int) -> None:
     # With λ = γ = 1 every error updates all states visited since the traces were cleared.
@@ -234,7 +240,8 @@ def test_parameters_go_through_a_file(make_model: MakeModel, tmp_path: pathlib.P
 
 
 def test_parameters_hold_the_ranges(algorithm: Algorithm, cart_pole: str) -> None:
-    measured, other = (algorithm(cart_pole, points=3, n_neighbors=2, seed=seed) for seed in (0, 1))
+    arguments = fitting(algorithm, {"points": 3, "n_neighbors": 2})
+    measured, other = (algorithm(cart_pole, seed=seed, **arguments) for seed in (0, 1))
     measured.learn(1050)
     other.set_parameters(measured.get_parameters())
     assert th.equal(other.policy.points, measured.policy.points)
@@ -249,8 +256,12 @@ def test_parameters_that_do_not_fit_are_refused(make_model: MakeModel) -> None:
         model.set_parameters({})
     with pytest.raises(ValueError, match="invalid object name"):
         model.set_parameters({**parameters, "no_such_part": {}})
+
+
+@TD_ONLY
+def test_parameters_of_other_points_are_refused(make_model: MakeModel) -> None:
     with pytest.raises(RuntimeError, match="size mismatch"):
-        model.set_parameters(make_model(points=(3, 3)).get_parameters())
+        make_model().set_parameters(make_model(points=(3, 3)).get_parameters())
 
 
 def test_parameters_are_loaded_without_running_code(make_model: MakeModel) -> None:

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_knntd import KNNTD, DeltaFilter, ExA
+from sb3_knntd import KNNTD, DeltaFilter, ExA, KNNDyna
 
 
 def main() -> None:
@@ -19,6 +19,9 @@ def main() -> None:
         model = KNNTD(env_id, policy_kwargs={"dtype": dtype}).learn(1)
         model.predict(np.asarray(model.observation_space.sample()), deterministic=True)
     ExA("MountainCarContinuous-v0").learn(1)
+    # A few plans: the first one only lays the points.
+    for env_id in ("MountainCar-v0", "MountainCarContinuous-v0", "FrozenLake-v1"):
+        KNNDyna(env_id).learn(100)
     env = DeltaFilter(gym.make("MountainCar-v0"))
     env.reset()
     env.step(0)

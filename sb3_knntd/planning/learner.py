@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.state_checks import checked_integer, checked_tensor, entry
 from sb3_knntd.common.transitions import check_transition
@@ -128,9 +127,7 @@ class DynaLearner(Learner):
             if terminated and env not in last:
                 # Where it ended is not known: that it ended is.
                 next_rows[env] = self._observations[env]
-            self.planner.add(
-                self._observations[env], actions[env], float(rewards[env]), next_rows[env], terminated
-            )
+            self.planner.add(self._observations[env], actions[env], float(rewards[env]), next_rows[env], terminated)
         self._observations[:] = rows
         self._rest -= 1
         for env in np.flatnonzero(ended).tolist():
@@ -186,7 +183,9 @@ class DynaLearner(Learner):
             np.asarray(each, dtype=np.float64).reshape(n, -1)
             for each in (transitions.observations, transitions.next_observations)
         )
-        actions = self.scaled_actions(np.asarray(transitions.actions).reshape(n, -1) if self._is_box else transitions.actions)
+        actions = self.scaled_actions(
+            np.asarray(transitions.actions).reshape(n, -1) if self._is_box else transitions.actions
+        )
         is_first = True
         for i in range(n):
             if is_first:

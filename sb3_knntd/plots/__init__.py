@@ -14,6 +14,7 @@ from sb3_knntd.plots.grids import (
     telling_dims,
     value_grid,
 )
+from sb3_knntd.plots.model_maps import Rollout, plot_model_points, plot_rollout, roll_out
 from sb3_knntd.plots.names import NAMES, Names, check_names, names_for
 from sb3_knntd.plots.value_maps import (
     MOST_NAMED_ACTIONS,
@@ -36,6 +37,7 @@ __all__ = [
     "NAMES",
     "UNLEARNED_COLOR",
     "Names",
+    "Rollout",
     "ValueGrid",
     "caption_of",
     "check_dims",
@@ -46,10 +48,13 @@ __all__ = [
     "names_for",
     "new_figure",
     "plot_learning_curve",
+    "plot_model_points",
     "plot_points",
+    "plot_rollout",
     "plot_routes",
     "plot_value_function",
     "plot_visits",
+    "roll_out",
     "running_median",
     "telling_dims",
     "value_grid",

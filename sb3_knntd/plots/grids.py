@@ -183,8 +183,7 @@ def _read_batch(model: KNNAlgorithm, observations: np.ndarray) -> _Reading:
         q_values = mean_rows(rows, probabilities)
         selector = policy.selector
         values = selector.greedy_value(rows, probabilities)
-        selected = selector.greedy_indices(rows, probabilities)
-        actions = selector.actions_of(selected, probabilities).cpu().numpy()
+        actions = selector.greedy_actions(rows, probabilities).cpu().numpy()
         learned = (rows != model.initial_value).flatten(1).any(dim=1)
     return _Reading(q_values.cpu().numpy(), values.cpu().numpy(), actions, learned.cpu().numpy())
 
