@@ -159,7 +159,9 @@ class DynaLearner(Learner):
         for env, observation in enumerate(self._observations):
             source = self.planner.optimistic if self._explores[env] else table
             # If the points are fewer than k, places without a point follow them.
-            indices, probabilities = (each[0, : len(source)].numpy() for each in self.perceiver.perceive_one(observation))
+            indices, probabilities = (
+                each[0, : len(source)].numpy() for each in self.perceiver.perceive_one(observation)
+            )
             values[env] = probabilities @ source[indices]
         self._columns[:] = pick_best(values, uniforms[:, 1])
         if self._is_box:
