@@ -63,8 +63,16 @@ REFUSED_BY_DYNA: dict[str, tuple[list[Any], str]] = {
     "reward_function": ([5, "mine", 0.5, True, [abs]], "(observation, action, next_observation)"),
 }
 NOT_OF_DYNA = {
-    *TD_ARGUMENTS, "bandwidth", "exploration", "reset_other_actions", "search", "step_size", "target", "traces", "weights"
-}  # fmt: skip
+    *TD_ARGUMENTS,
+    "bandwidth",
+    "exploration",
+    "reset_other_actions",
+    "search",
+    "step_size",
+    "target",
+    "traces",
+    "weights",
+}
 CASES = [
     *((KNNTD, argument, values) for argument, values in REFUSED.items()),
     *((KNNDyna, argument, REFUSED[argument]) for argument in REFUSED.keys() - NOT_OF_DYNA),

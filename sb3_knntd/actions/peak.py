@@ -91,4 +91,5 @@ class PeakSelector(MeanValueSelector):
             np.abs(given[:, dimension, None] - points).argmin(axis=1)
             for dimension, points in enumerate(self.columns.lists)
         ]
-        return np.ravel_multi_index(nearest, shape)[:, None].astype(np.int64)
+        columns: np.ndarray = np.ravel_multi_index(nearest, shape)[:, None].astype(np.int64)
+        return columns
