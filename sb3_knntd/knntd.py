@@ -48,11 +48,17 @@ class KNNTD(KNNAlgorithm):
         Discrete, MultiDiscrete and MultiBinary observations
     :param points: the perception points: an int or one int per dimension for a lattice over the bounds, or an array
         (n_points, obs_dim) in observation units for scattered points; ``"auto"`` is a lattice of about 8000 points,
-        at most 20 per dimension, or one point per state on Discrete, MultiDiscrete and MultiBinary observations
+        at most 20 per dimension, or one point per state on Discrete, MultiDiscrete and MultiBinary observations; with
+        ``"grow"`` there are none at first, and each observation farther than ``spacing`` from all points becomes one
+    :param spacing: of points that grow, in [1e-100, 10⁴], scaled units; ``"auto"`` is 0.06 (obs_dim - 1), at least 0.04
+    :param max_points: largest number of points that grow, >= 2. When it is reached, the spacing grows by 2^(1/obs_dim)
+        until there is room for more, and points nearer than that to another are dropped
     :param bounds: the range mapped to [-1, 1]: (low, high), arrays (obs_dim,) in observation units; ``None`` takes the
         bounds of the space, and measures the range of unbounded dimensions in a random phase at the start of
         :meth:`learn`; ``"adaptive"`` measures the range of every dimension, and widens it whenever an observation lies
-        outside: the values are then carried over to the new points of the lattice, and traces are dropped
+        outside: the values are then carried over to the new points of the lattice, and traces are dropped. With points
+        that grow, the range of these dimensions is the one visited so far, from the first step on: when it has grown
+        by more than a tenth, all is scaled anew, and points that have come too near to another are dropped
     :param weights: ``"inverse_quadratic"``: 1 / (1 + d²/h²), eq. 5; ``"gaussian"``: exp(-d²/2h²); or a function from
         squared distances (batch, k), scaled units, to weights (batch, k), both torch tensors
     :param bandwidth: h of the weights, >= 1e-100, scaled units (the range of each dimension has width 2)

@@ -8,11 +8,15 @@ import math
 import pathlib
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import optuna
 import pytest
 import yaml
+from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
@@ -159,6 +163,147 @@ def test_learning_has_the_tables_of_the_issue(benchmarks: Any) -> None:
     # 64 environments are compared with one over the same number of steps.
     assert {case.n_envs for case in tables["envs"]} >= {1, 64}
     assert len({(case.env_id, case.steps) for case in tables["envs"]}) == 1
+
+
+def steady(*action: float) -> Any:
+    """A model that always takes the same action."""
+    return SimpleNamespace(predict=lambda observations, **_: (np.array([action] * len(observations)), None))
+
+
+def test_an_evaluation_ends_when_the_threshold_is_out_of_reach(benchmarks: Any) -> None:
+    efficiency = benchmarks("sample_efficiency")
+    # Each step costs 1, and an episode of MountainCar-v0 that only idles has 200 of them.
+    envs = make_vec_env("MountainCar-v0", 4, seed=0)
+    idle = SimpleNamespace(predict=lambda observations, **_: (np.ones(len(observations), np.int64), None))
+    goal = efficiency.Goal("MountainCar-v0", threshold=-110.0, most=0.0)
+    assert efficiency.evaluate(idle, envs, goal) == -111.0
+    assert efficiency.evaluate(idle, envs, goal, to_the_end=True) == -200.0
+    assert efficiency.evaluate(idle, envs, goal._replace(threshold=-200.0)) == -200.0
+
+
+@pytest.mark.parametrize(("angle", "share"), [(0.0, 1.0), (math.pi, 0.0)])
+def test_the_swing_up_is_measured_by_how_long_the_pole_is_up(benchmarks: Any, angle: float, share: float) -> None:
+    efficiency = benchmarks("sample_efficiency")
+    goal = efficiency.TASKS["sb3_knntd/CartPoleSwingUp-v0"].goal
+    # Without a push the pole stays where it is.
+    start = {"start": (0.0, 0.0, angle, 0.0)}
+    envs = make_vec_env(goal.env_id, 2, seed=0, env_kwargs=start)
+    assert efficiency.evaluate(steady(0.0), envs, goal) == pytest.approx(share)
+
+
+def test_an_episode_that_ends_early_has_the_pole_up_for_a_small_share(benchmarks: Any) -> None:
+    efficiency = benchmarks("sample_efficiency")
+    goal = efficiency.TASKS["sb3_knntd/CartPoleSwingUp-v0"].goal
+    envs = make_vec_env(goal.env_id, 1, seed=0, env_kwargs={"start": (2.3, 2.0, 0.0, 0.0)})
+    assert efficiency.evaluate(steady(0.0), envs, goal) <= 2 / 200
+
+
+@pytest.mark.parametrize(("threshold", "steps"), [(-1000.0, 250), (0.0, None)])
+def test_training_ends_at_the_threshold_or_at_the_limit(benchmarks: Any, threshold: float, steps: int | None) -> None:
+    efficiency = benchmarks("sample_efficiency")
+    goal = efficiency.Goal("MountainCar-v0", threshold, 0.0)._asdict()
+    result = efficiency.train(goal, "knntd", {"policy": "KNNPolicy"}, limit=600, seed=3, warm=False)
+    assert result["steps"] == steps
+    assert (result["at_end"] is None) == (steps is not None)
+    assert result["at_end"] is None or -200.0 <= result["at_end"] < 0.0
+    assert result["cpu_seconds"] > 0.0
+    assert result["seconds"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("steps", "is_met"),
+    [
+        ([750, 1000, 1000, 2000], True),
+        ([250, 250, 250, 2250], False),
+        ([250, 1250, 1250, 2000], False),
+        ([250, 250, 250, math.inf], False),
+    ],
+)
+def test_a_task_is_met_by_median_and_by_most_seeds(benchmarks: Any, steps: list[float], is_met: bool) -> None:
+    efficiency = benchmarks("sample_efficiency")
+    line = efficiency.TASKS["Pendulum-v1"]
+    assert efficiency.is_met(line, steps) is is_met
+    assert efficiency.is_met(line._replace(n_of_ten=7, median=1250), steps) is True
+    assert efficiency.is_met(line.times(2), [2 * number for number in steps]) is is_met
+
+
+def test_no_threshold_is_above_what_an_episode_can_have(benchmarks: Any) -> None:
+    for line in benchmarks("sample_efficiency").TASKS.values():
+        assert line.goal.most >= max(line.goal.threshold, 0.0)
+
+
+def test_learning_tells_steps_to_thresholds(
+    benchmarks: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: pathlib.Path
+) -> None:
+    learning, efficiency = benchmarks("learning"), benchmarks("sample_efficiency")
+    computed: list[str] = []
+
+    def outcomes(jobs: list[Job], folder: pathlib.Path, *_: Any) -> dict[str, Outcome]:
+        assert folder == tmp_path
+        computed.extend(job.key for job in jobs)
+        steps = {5: 500, 6: 1500, 7: None}
+        return {
+            job.key: Outcome(
+                {"steps": steps[job.arguments["seed"]], "cpu_seconds": 1.5, "seconds": 2.0, "at_end": -300.0}
+            )
+            for job in jobs
+        }
+
+    def make(env_id: str) -> Any:
+        if env_id == "InvertedPendulum-v5":
+            raise DependencyNotInstalled("no simulator")
+        return gym.make(env_id)
+
+    monkeypatch.setattr(efficiency, "run_jobs", outcomes)
+    monkeypatch.setattr(efficiency, "gym", SimpleNamespace(make=make, spec=gym.spec))
+    file = tmp_path / "steps.json"
+    command = ["--seeds", "3", "--first-seed", "5", "--runs", str(tmp_path), "--json", str(file)]
+    envs = ["--env", "Pendulum-v1", "InvertedPendulum-v5"]
+    monkeypatch.setattr(sys, "argv", ["learning", "--only", "dyna", "rivals", *command, *envs])
+    learning.main()
+    printed, told = capsys.readouterr()
+    assert "InvertedPendulum-v5 is left out: no simulator" in told
+    assert (
+        "| Pendulum-v1, -200 | 1,500 | 2 of 3 within 2,000 | 1.5 | <= 1,000; 10 of 10 within 2,000 | no "
+        "| 500 1,500 > 4,000 |"
+    ) in printed
+    assert "| 1,500 | 2 of 3 within 4,000 | 1.5 | <= 2,000; 10 of 10 within 4,000 | no |" in printed
+    assert "| Pendulum-v1, -200 | SAC | 1,500 | 2 of 3 within 4,000 | 1.5 | 500 1,500 > 4,000 |" in printed
+    assert "| Pendulum-v1, -200 | CrossQ |" in printed
+    stored = json.loads(file.read_text())
+    assert [(row["table"], row["goal"]["env_id"]) for row in stored["dyna"]] == [
+        ("tuned", "Pendulum-v1"),
+        ("defaults", "Pendulum-v1"),
+    ]
+    assert [run["steps"] for run in stored["rivals"][0]["runs"]] == [500, 1500, None]
+    # No run is computed twice.
+    assert len(computed) == len(set(computed))
+
+
+def test_learning_knows_a_task_for_every_rival(benchmarks: Any) -> None:
+    efficiency = benchmarks("sample_efficiency")
+    assert {rival.env_id for rival in efficiency.RIVALS} == set(efficiency.TASKS)
+    assert len({rival[:2] for rival in efficiency.RIVALS}) == len(efficiency.RIVALS)
+
+
+def test_planning_cost_measures_every_size(benchmarks: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    cost = benchmarks("planning_cost")
+    monkeypatch.setattr(cost, "WARM_UP", 200)
+    costs = cost.measure("CartPole-v1", [150, 300], window=100)
+    assert [each.size for each in costs] == [150, 300]
+    for each in costs:
+        assert each.planning > 0.0
+        assert each.longest >= each.step > 0.0
+        assert each.longest_wall > 0.0
+
+
+def test_planning_cost_refuses_sizes_that_overlap(
+    benchmarks: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["planning_cost", "--sizes", "10000", "11000"])
+    with pytest.raises(SystemExit, match="2"):
+        benchmarks("planning_cost").main()
+    assert "[10000, 11000]" in capsys.readouterr().err
 
 
 def test_the_zoo_benchmark_trains_as_the_command_does(

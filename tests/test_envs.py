@@ -1,4 +1,4 @@
-"""The paper's environments: equations, options, and compliance with gymnasium."""
+"""Environments: the equations and options of the paper's, and compliance of all of them with gymnasium."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from sb3_knntd.envs.mountain_car import mountain_car_step
 
 CAR, POLE = "sb3_knntd/MountainCar-v0", "sb3_knntd/CartPole-v0"
 CONTINUOUS, ACROBOT = "sb3_knntd/ContinuousCartPole-v0", "sb3_knntd/Acrobot-v0"
+SWING_UP = "sb3_knntd/CartPoleSwingUp-v0"
 ALL = (CAR, POLE, CONTINUOUS, ACROBOT)
 
 # Every environment with its defaults, and with each argument changed at least once.
@@ -42,6 +43,9 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
     (CONTINUOUS, {"start": "uniform", "reward": "step", "failure_angle": 45.0, "track": 1, "noise": 0.01}),
     (ACROBOT, {"dynamics": "nips", "start": "uniform", "reward": "goal", "noise": 0.2}),
     (ACROBOT, {"start": (math.pi, -math.pi, 4 * math.pi, -9 * math.pi)}),
+    (SWING_UP, {}),
+    (SWING_UP, {"start": "fixed", "frame_skip": 2, "noise": [0.0, 0.1, 0.1, 0.1, 0.0]}),
+    (SWING_UP, {"start": (2.4, -1.0, 9.0, 5.0)}),
 ]
 
 
@@ -473,7 +477,7 @@ def test_observations_stay_in_the_space_and_repeat_with_the_seed(name: str, kwar
     assert rolls[0][1] == rolls[1][1]
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", [*ALL, SWING_UP])
 def test_environments_can_be_pickled(name: str) -> None:
     env = make(name, noise=0.1)
     env.reset(seed=0)
@@ -579,7 +583,7 @@ def test_bad_actions(name: str, actions: list[Any], way_out: str) -> None:
         assert env.state == FIXED[name]
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", [*ALL, SWING_UP])
 def test_step_and_render_need_a_reset_first(name: str) -> None:
     env = make(name, render_mode="rgb_array")
     with pytest.raises(ResetNeeded, match=r"reset\(\) before step"):
@@ -592,19 +596,25 @@ def test_step_and_render_need_a_reset_first(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "kwargs"), [*((name, {}) for name in ALL), (POLE, {"track": 0.2}), (POLE, {"failure_angle": 45})]
+    ("name", "kwargs"),
+    [
+        *((name, {}) for name in ALL),
+        (POLE, {"track": 0.2}),
+        (POLE, {"failure_angle": 45}),
+        (SWING_UP, {"start": "fixed"}),
+    ],
 )
 def test_pictures_show_the_state_and_the_action(name: str, kwargs: dict[str, Any]) -> None:
     pytest.importorskip("pygame")
     env = make(name, render_mode="rgb_array", **kwargs)
-    size = {CAR: (400, 600, 3), ACROBOT: (500, 500, 3)}.get(name, (220, 800, 3))
+    size = {CAR: (400, 600, 3), ACROBOT: (500, 500, 3), SWING_UP: (320, 800, 3)}.get(name, (220, 800, 3))
     env.reset()
     first = env.render()
     assert first.shape == size
     assert first.dtype == np.uint8
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 10
     np.testing.assert_array_equal(first, env.render())
-    env.step(0 if name != CONTINUOUS else np.array([-1.0]))
+    env.step(np.array([-1.0]) if name in (CONTINUOUS, SWING_UP) else 0)
     pushed = env.render()
     assert (pushed != first).any()
     env.reset()
@@ -623,7 +633,7 @@ def test_pictures_need_no_display(monkeypatch: pytest.MonkeyPatch) -> None:
     env.render()
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", [*ALL, SWING_UP])
 @pytest.mark.usefixtures("headless")
 def test_windows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     import pygame

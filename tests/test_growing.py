@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pathlib
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from test_robustness import read_in_threads
 from toy_envs import DriftEnv, GridEnv, PushEnv, RecordingVecEnv, StillEnv
 
 from sb3_knntd import KNNTD, ExA
@@ -103,20 +105,20 @@ def test_points_are_as_far_apart_as_the_spacing_and_near_what_is_visited(
         n_neighbors=3,
         bounds=(-np.ones(n_dims), np.ones(n_dims)) if known else "adaptive",
     )
-    random, policy = np.random.default_rng(seed), model.policy
+    random, policy, was_full = np.random.default_rng(seed), model.policy, False
     visited = random.normal(0.0, 0.5, (120, n_dims)) * np.logspace(0, 2, n_dims)
     visited = visited.cumsum(axis=0) if walk else visited
     for observation in visited:
         keep_up(policy, observation[None])
         points = policy.perceiver.points
+        was_full |= points.is_full
         assert points.n_points <= max_points
         assert least_distance(policy) > float(points.spacing)
         # It lies within the spacing of a point when its step is over, however many points there may be.
         assert distances(policy, observation[None]).min() <= float(points.spacing)
     assert {tuple(point) for point in policy.points.numpy()} <= {tuple(observation) for observation in visited}
     assert len(policy.q_table) == len(policy.points)
-    enough = points.n_points < max_points and known
-    assert float(points.spacing) == spacing or not enough
+    assert float(points.spacing) == spacing or was_full
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -130,9 +132,9 @@ def test_all_that_is_perceived_lies_near_a_point(algorithm: Algorithm, kwargs: d
     seen = [step.observations for step in venv.steps] + [step.arrived[step.truncated] for step in venv.steps]
     assert distances(model.policy, np.concatenate(seen)).min(axis=1).max() <= 0.1
     assert least_distance(model.policy) > 0.1
-    # A terminal state has no value to read: it is no point unless others are near.
+    # A terminal state has no value to read.
     ends = np.concatenate([step.arrived[step.terminated] for step in venv.steps])
-    assert distances(model.policy, ends).min(axis=1).max() > 0.1
+    assert not {tuple(end) for end in ends.tolist()} & {tuple(point) for point in model.policy.points.tolist()}
 
 
 def test_the_default_spacing_grows_with_the_dimensions() -> None:
@@ -145,18 +147,18 @@ def test_when_there_are_too_many_points_every_second_one_stays() -> None:
     """The spacing grows by 2^(1/D), and what was learned at the dropped points goes to those that stay."""
     model = KNNTD(StillEnv(1), points="grow", spacing=0.1, max_points=8, bounds=([-1.0], [1.0]), n_neighbors=1)
     policy = model.policy
-    policy.grow(np.arange(8)[:, None] * 0.11)
+    policy.grow(np.arange(8)[:, None] * 0.125)
     assert policy.perceiver.points.is_full
     policy.q_table.copy_(th.arange(8.0)[:, None].expand(8, 3))
     policy.table.visit(th.tensor([0, 1, 2, 3, 5]))  # type: ignore[operator]
     moved = policy.lay_anew(np.array([[0.0]]))
     np.testing.assert_array_equal(moved, [0, 0, 1, 1, 2, 2, 3, 3])
-    np.testing.assert_allclose(policy.points.numpy()[:, 0], [0.0, 0.22, 0.44, 0.66])
+    np.testing.assert_allclose(policy.points.numpy()[:, 0], [0.0, 0.25, 0.5, 0.75])
     assert float(policy.perceiver.points.spacing) == 0.2  # type: ignore[arg-type]
     # The mean of the visited ones; of all where none was visited.
     assert policy.q_table[:, 0].tolist() == [0.5, 2.5, 5.0, 6.5]
     assert policy.table.n_visited == 3
-    assert policy.grow(np.array([[0.3], [0.95]])).tolist() == [4]
+    assert policy.grow(np.array([[0.4], [0.96]])).tolist() == [4]
 
 
 # ----------------------------------------------------- the scale that follows
@@ -228,7 +230,7 @@ def test_normalised_observations_are_followed() -> None:
 def test_a_new_point_is_worth_what_was_read_there_or_the_initial_value(initial_value: float) -> None:
     model = make_model(initial_value=initial_value).learn(300)
     policy = model.policy
-    new = np.array([[0.4, 0.05], [-0.95, 0.055]])
+    new = np.array([[2.0, 0.05], [-0.95, 0.2]])
     for observation in new:
         read = policy.q_values(observation)
         (index,) = policy.grow(observation[None])
@@ -287,7 +289,9 @@ def test_once_grown_it_learns_like_one_with_these_points(algorithm: Algorithm) -
     points = grown.policy.points.numpy()
     fixed = make_model(algorithm, points=points, spacing="auto")
     again = make_model(algorithm)
-    again.policy.load_state_dict({**grown.policy.state_dict(), "table.values": th.zeros_like(grown.policy.q_table)})
+    # From here on nothing is far enough to become a point.
+    state = {"table.values": th.zeros_like(grown.policy.q_table), "perceiver.points.spacing": th.tensor(1e3).double()}
+    again.policy.load_state_dict({**grown.policy.state_dict(), **state})
     for model in (fixed, again):
         model.learn(300)
     assert len(again.policy.points) == len(points)
@@ -298,15 +302,16 @@ def test_once_grown_it_learns_like_one_with_these_points(algorithm: Algorithm) -
 @pytest.mark.parametrize("n_envs", [1, 2])
 @pytest.mark.parametrize(
     "arguments",
-    [{}, {"known": False}, {"max_points": 20, "trace_decay": 0.5}, {"weights": "gaussian", "bandwidth": 0.1}],
+    [{}, {"known": False}, {"max_points": 30, "trace_decay": 0.5}, {"weights": "gaussian", "bandwidth": 0.1}],
     ids=["known", "unknown", "few", "gaussian"],
 )
 def test_compiled_and_torch_learn_the_same(algorithm: Algorithm, n_envs: int, arguments: dict[str, Any]) -> None:
     one, other = (
-        make_model(algorithm, n_envs, policy_kwargs=kwargs, tie_break="first", **arguments).learn(500)
+        make_model(algorithm, n_envs, policy_kwargs=kwargs, tie_break="first", **arguments).learn(300)
         for kwargs in LEARNERS.values()
     )
-    assert th.equal(one.policy.points, other.policy.points)
+    # ExA's actions, and so the observations, may differ in the last digit.
+    th.testing.assert_close(one.policy.points, other.policy.points, rtol=1e-6, atol=1e-6)
     th.testing.assert_close(one.policy.q_table, other.policy.q_table, rtol=1e-7, atol=1e-7)
     assert one.policy.table.n_visited == other.policy.table.n_visited
     assert one.policy.perceiver.points.spacing == other.policy.perceiver.points.spacing
@@ -358,7 +363,7 @@ def test_interrupted_run_equals_the_uninterrupted(
     resumed: Any = algorithm.load(tmp_path / "model", env=broken.get_env(), force_reset=False)
     assert th.equal(resumed.policy.points, broken.policy.points)
     resumed.learn(200, reset_num_timesteps=False)
-    assert len(whole.policy.points) > len(broken.policy.points)
+    assert not th.equal(whole.policy.points, broken.policy.points)
     assert th.equal(resumed.policy.points, whole.policy.points)
     assert th.equal(resumed.policy.q_table, whole.policy.q_table)
     assert resumed.policy.table.n_visited == whole.policy.table.n_visited
@@ -431,6 +436,33 @@ def test_a_failure_leaves_points_and_table_as_they_were(monkeypatch: pytest.Monk
     assert len(policy.points) == len(policy.q_table)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_an_interrupt_while_a_point_comes_waits_until_it_is_there(monkeypatch: pytest.MonkeyPatch, known: bool) -> None:
+    model, real, count = make_model(known=known), GrowingTable.add_rows, itertools.count()
+
+    def add_rows(table: GrowingTable, values: th.Tensor) -> None:
+        if next(count) == 30:
+            signal.raise_signal(signal.SIGINT)
+        real(table, values)
+
+    monkeypatch.setattr(GrowingTable, "add_rows", add_rows)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(300)
+    assert len(model.policy.points) == len(model.policy.q_table)
+    assert least_distance(model.policy) > 0.1
+    model.learn(100)
+    assert th.isfinite(model.policy.q_table).all()
+
+
+@pytest.mark.parametrize("kwargs", LEARNERS.values(), ids=LEARNERS)
+def test_reading_in_other_threads_changes_nothing(kwargs: dict[str, Any]) -> None:
+    alone, read = (make_model(known=False, max_points=80, policy_kwargs=kwargs) for _ in range(2))
+    alone.learn(700)
+    assert read_in_threads(read, 700, 200) >= 200
+    assert th.equal(alone.policy.points, read.policy.points)
+    assert th.equal(alone.policy.q_table, read.policy.q_table)
+
+
 def test_a_step_that_fails_leaves_the_values_as_they_were() -> None:
     model = make_model(learning_rate=1e200)
     with pytest.raises(FloatingPointError, match="The table is as it was"):
@@ -466,14 +498,15 @@ def test_what_does_not_go_with_points_that_grow_is_named() -> None:
 
 def test_a_range_that_grows_does_not_stop_learning() -> None:
     """Traces end where points are dropped, and episodes go on."""
-    model, dropped = make_model(known=False), []
+    model = make_model(known=False)
+    dropped: list[bool] = []
 
     def look(local: dict[str, Any], _: dict[str, Any]) -> bool:
         dropped.append(not model.learner.in_episodes)
         return True
 
-    model.learn(400, callback=look)
-    assert any(dropped)
-    assert not any(dropped[200:])
+    model.learn(1500, callback=look)
+    # More and more seldom: each time, a range has grown by a tenth.
+    assert sum(dropped[:500]) > sum(dropped[500:1000]) + sum(dropped[1000:])
     assert any(before and not after for before, after in itertools.pairwise(dropped))
     assert model.policy.table.n_visited > 20

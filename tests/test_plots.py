@@ -25,7 +25,7 @@ from sb3_knntd.plots import (
     figure_of,
     new_figure,
     plot_learning_curve,
-    plot_points,
+    plot_model_points,
     plot_rollout,
     plot_value_function,
     roll_out,
@@ -173,6 +173,21 @@ def test_unvisited_cells_are_masked() -> None:
     assert not values.mask[:, :15].any()
     assert values.mask[:, 25:].all()
     assert [text.get_text() for text in axes[0].texts] == ["grey: nothing learned"]
+
+
+def test_points_that_grow_are_drawn(tmp_path: Path) -> None:
+    """Also those beyond the range that was visited when all was scaled, and none before learning."""
+    model = make_model([-1.0, -np.inf], [1.0, np.inf], points="grow", n_neighbors=2)
+    for observation in ([0.2, 3.0], [0.4, 3.0], [0.4, 5.0], [0.9, 4.0]):
+        axes = plot_value_function(model)
+        figure_of(axes[0]).savefig(tmp_path / "map.png")
+        for ax in axes:
+            drawn = np.stack(lines_of(ax)["points"], axis=1)
+            np.testing.assert_array_equal(drawn, model.policy.points.numpy())
+        model.policy.lay_anew(np.array([observation]))
+        model.policy.grow(np.array([observation]))
+    assert axes[0].get_ylim() == (3.0, 5.0)
+    assert not lines_of(plot_value_function(make_model([-1.0, -1.0], [1.0, 1.0]))[0])
 
 
 def test_an_untrained_model_can_be_drawn(tmp_path: Path) -> None:
@@ -355,7 +370,7 @@ def corridor_model() -> KNNDyna:
 
 def test_points_are_drawn_with_the_number_of_actions_that_are_known() -> None:
     model = KNNDyna(DriftEnv(), spacing=0.1, simulated_steps=5, seed=0).learn(150)
-    axes = plot_points(model, dims=(1, 0))
+    axes = plot_model_points(model, dims=(1, 0))
     (drawn,) = axes.collections
     np.testing.assert_array_equal(np.asarray(drawn.get_offsets()), model.policy.points.numpy()[:, ::-1])
     known = model.learner.planner.known
@@ -367,20 +382,20 @@ def test_points_are_drawn_with_the_number_of_actions_that_are_known() -> None:
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("observation[1]", "observation[0]")
     # Another algorithm knows the entries that it has updated.
     grown = KNNTD(DriftEnv(), points="grow", spacing=0.1, seed=0).learn(150)
-    (drawn,) = plot_points(grown, names=Names(("x", "v"), ("l", "n", "r"))).collections
+    (drawn,) = plot_model_points(grown, names=Names(("x", "v"), ("l", "n", "r"))).collections
     np.testing.assert_array_equal(np.asarray(drawn.get_array()), (grown.policy.q_table != 0).sum(dim=1).numpy())
 
 
 @pytest.mark.parametrize("dims", [(0, 0), (0, 2), (-1, 0), "xy"])
 def test_points_are_drawn_over_two_dimensions(dims: Any) -> None:
     with pytest.raises(ValueError, match="dims must be two different dimensions"):
-        plot_points(KNNDyna(DriftEnv()), dims)
+        plot_model_points(KNNDyna(DriftEnv()), dims)
 
 
 def test_points_of_states_and_of_one_dimension_are_not_drawn(corridor_model: KNNDyna) -> None:
     for model in (corridor_model, KNNDyna(GridEnv())):
         with pytest.raises(ValueError, match="observations must be a Box of 2 or more dimensions; got"):
-            plot_points(model)
+            plot_model_points(model)
 
 
 def test_a_rollout_follows_the_model(corridor_model: KNNDyna) -> None:

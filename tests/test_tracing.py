@@ -27,6 +27,8 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
     "defaults": {},
     "brute lattice": {"points": (9, 7), "search": "brute"},
     "brute": {"points": SCATTERED, "search": "brute"},
+    "grow": {"points": "grow", "spacing": 0.2},
+    "few": {"points": "grow", "spacing": 1.0, "n_neighbors": 9, "weights": "gaussian", "bandwidth": 0.2},
     "kd_tree": {"points": SCATTERED, "search": "kd_tree"},
     "ties": {"points": ROUND_PLACES, "search": "kd_tree", "n_neighbors": 6},
     "gaussian": {"weights": "gaussian", "bandwidth": 0.3},

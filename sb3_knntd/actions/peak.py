@@ -64,7 +64,11 @@ class PeakSelector(MeanValueSelector):
             curvature = (slope_right - slope_left) / (left + right)
             slope = (slope_left * right + slope_right * left) / (left + right)
             offset = (-0.5 * slope / curvature).clamp(min=-0.5 * left, max=0.5 * right)
-            has_peak = (left > 0) & (right > 0) & (curvature * (left + right) ** 2 < -LEAST_CURVATURE * middle.abs().clamp(min=1.0))
+            has_peak = (
+                (left > 0)
+                & (right > 0)
+                & (curvature * (left + right) ** 2 < -LEAST_CURVATURE * middle.abs().clamp(min=1.0))
+            )
             actions[:, dimension] += th.where(has_peak, offset, 0.0)
         return actions
 

@@ -21,14 +21,15 @@ State = tuple[float, ...]
 
 class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC):
     """
-    An environment whose state is a tuple of floats and whose observation is that state, optionally with noise.
+    An environment whose state is a tuple of floats and whose observation is that state, or what :meth:`_exact` makes
+    of it, optionally with noise.
 
     The noise is Gaussian and drawn independently for each observation from the environment's own generator. It affects
     only the observations: the state, the reward and the end of an episode are exact. With noise, ``info["state"]`` is
     the true state as a float64 array. Observations are clipped to the observation space.
 
-    :param observation_space: a Box of shape (state_dim,)
-    :param ranges: width of each dimension's usual range, shape (state_dim,), state units; the unit of ``noise``
+    :param observation_space: a Box of shape (obs_dim,)
+    :param ranges: width of each observation dimension's usual range, shape (obs_dim,); the unit of ``noise``
     :param starts: the named distributions of initial states, including "uniform": for each name the limits (low, high)
         of a uniform distribution, two states
     :param start: one of these names, or a state
@@ -138,14 +139,20 @@ class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC)
         """Reset attributes that belong to the previous episode."""
 
     def _observe(self) -> npt.NDArray[np.float32]:
-        observed = np.array(self.state, dtype=np.float64)
+        observed = np.array(self._exact(), dtype=np.float64)
         if self._noisy:
             observed = self._fold(observed + self._deviation * self.np_random.standard_normal(len(observed)))
         return np.minimum(np.maximum(observed, self._low), self._high).astype(np.float32)
 
+    def _exact(self) -> Sequence[float]:
+        """
+        :return: the observation of the state before noise and clipping, shape (obs_dim,)
+        """
+        return self._known_state()
+
     def _fold(self, observed: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """
-        :param observed: state plus noise
+        :param observed: observation plus noise
         :return: the same with angles wrapped to [-π, π]
         """
         return observed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +15,34 @@ from sb3_knntd.common.checks import check_integer, check_number, check_word
 from sb3_knntd.envs.base import ActionT, PaperEnv, State
 from sb3_knntd.envs.rendering import BLUE, GROUND, INK, ORANGE, SKY, STEEL, Canvas, turned
 
-GRAVITY = 9.8
-CART_MASS = 1.0
-POLE_MASS = 0.1
-HALF_LENGTH = 0.5
-MAX_FORCE = 10.0
-TIME_STEP = 0.02
+
+class Physics(NamedTuple):
+    """
+    The constants of a cart-pole.
+
+    :param gravity: m/s²
+    :param cart_mass: kg
+    :param pole_mass: kg
+    :param half_length: distance of the pole's centre of mass from its joint, half of its length, m
+    :param max_force: force of a push of 1, N
+    :param friction: force on the cart per velocity, N s/m
+    :param time_step: s
+    """
+
+    gravity: float
+    cart_mass: float
+    pole_mass: float
+    half_length: float
+    max_force: float
+    friction: float
+    time_step: float
+
+
+#: Barto, Sutton and Anderson, "Neuronlike adaptive elements that can solve difficult learning control problems" (1983),
+#: without friction.
+STANDARD = Physics(
+    gravity=9.8, cart_mass=1.0, pole_mass=0.1, half_length=0.5, max_force=10.0, friction=0.0, time_step=0.02
+)
 
 #: Velocities are unbounded. As in gymnasium, their limit is the largest float32 instead of infinity.
 UNLIMITED = float(np.finfo(np.float32).max)
@@ -28,30 +50,36 @@ UNLIMITED = float(np.finfo(np.float32).max)
 USUAL_SPEED = 3.0
 USUAL_ROTATION = math.radians(60.0)
 
+#: Height of the pole's joint above the track in pictures, m.
+JOINT_HEIGHT = 0.3
 
-def cart_pole_step(state: tuple[float, float, float, float], push: float) -> tuple[float, float, float, float]:
+
+def cart_pole_step(
+    state: tuple[float, float, float, float], push: float, physics: Physics = STANDARD
+) -> tuple[float, float, float, float]:
     """
-    One Euler step of 0.02 s of the standard cart-pole (Barto, Sutton and Anderson, "Neuronlike adaptive elements
-    that can solve difficult learning control problems", 1983), without friction.
+    One Euler step of a cart-pole.
 
     The function can be compiled by numba.
 
     :param state: position (m), velocity (m/s), the pole's angle from upright (rad) and angular velocity (rad/s)
-    :param push: force as a share of 10 N, in [-1, 1]; positive is to the right
+    :param push: share of the largest force, in [-1, 1]; positive is to the right
+    :param physics: the constants, by default those of the standard cart-pole
     :return: the state after the step
     """
     position, velocity, angle, rotation = state[0], state[1], state[2], state[3]
-    mass = CART_MASS + POLE_MASS
-    moment = POLE_MASS * HALF_LENGTH
+    gravity, cart_mass, pole_mass, half_length, max_force, friction, time_step = physics
+    mass = cart_mass + pole_mass
+    moment = pole_mass * half_length
     cos, sin = math.cos(angle), math.sin(angle)
-    pushed = (MAX_FORCE * push + moment * rotation * rotation * sin) / mass
-    turn = (GRAVITY * sin - cos * pushed) / (HALF_LENGTH * (4.0 / 3.0 - POLE_MASS * cos * cos / mass))
+    pushed = (max_force * push - friction * velocity + moment * rotation * rotation * sin) / mass
+    turn = (gravity * sin - cos * pushed) / (half_length * (4.0 / 3.0 - pole_mass * cos * cos / mass))
     drive = pushed - moment * turn * cos / mass
     return (
-        position + TIME_STEP * velocity,
-        velocity + TIME_STEP * drive,
-        angle + TIME_STEP * rotation,
-        rotation + TIME_STEP * turn,
+        position + time_step * velocity,
+        velocity + time_step * drive,
+        angle + time_step * rotation,
+        rotation + time_step * turn,
     )
 
 
@@ -78,6 +106,53 @@ def cart_pole_shaped_reward(state: tuple[float, float, float, float], failed: bo
     if failed:
         return -10000.0 - 50.0 * position - 100.0 * angle
     return 10.0 - 10.0 * (10.0 * angle) ** 2 - 5.0 * position - 10.0 * rotation
+
+
+def checked_push(action: npt.NDArray[np.floating[Any]]) -> float:
+    """
+    :param action: the force as a share of the largest, one number in an array of shape (1,)
+    :return: the number, clipped to [-1, 1]
+    :raises ValueError: if it is not one finite number
+    """
+    try:
+        push = float(np.asarray(action).item())
+    except (TypeError, ValueError):
+        push = math.nan
+    if not math.isfinite(push):
+        raise ValueError(f"action must be one finite number in an array of shape (1,); got {action!r}")
+    return min(max(push, -1.0), 1.0)
+
+
+def draw_track(canvas: Canvas, track: float) -> None:
+    """
+    :param canvas: where to draw
+    :param track: largest distance of the cart from the centre, m
+    """
+    canvas.bar((-track, 0.0), (track, 0.0), 0.04, STEEL)
+    for metre in range(-math.floor(track), math.floor(track) + 1):
+        canvas.bar((metre, -0.06), (metre, -0.16 if metre else -0.24), 0.02, STEEL)
+    for side in (-1, 1):
+        canvas.bar((side * (track + 0.34), 0.0), (side * (track + 0.34), 0.3), 0.07, INK)
+
+
+def draw_cart_pole(canvas: Canvas, position: float, angle: float, push: float, length: float) -> None:
+    """
+    :param canvas: where to draw
+    :param position: position of the cart, m
+    :param angle: angle of the pole from upright, rad
+    :param push: share of the largest force, in [-1, 1]
+    :param length: length of the pole, m
+    """
+    pivot = (position, JOINT_HEIGHT)
+    canvas.polygon(turned([(-0.3, 0.1), (0.3, 0.1), (0.3, 0.3), (-0.3, 0.3)], 0.0, (position, 0.0)), INK)
+    for wheel in (-0.18, 0.18):
+        canvas.circle((position + wheel, 0.09), 0.075, STEEL)
+        canvas.circle((position + wheel, 0.09), 0.03, INK)
+    canvas.bar(pivot, turned([(0.0, length)], -angle, pivot)[0], 0.075, BLUE)
+    canvas.circle(pivot, 0.06, SKY)
+    canvas.circle(pivot, 0.035, INK)
+    if push:
+        canvas.arrow((position, -0.36), (position + 0.75 * push, -0.36), 0.06, ORANGE)
 
 
 class _CartPoleEnv(PaperEnv[ActionT]):
@@ -158,27 +233,14 @@ class _CartPoleEnv(PaperEnv[ActionT]):
         canvas.fill(SKY)
         far = self.track + 10.0
         canvas.polygon([(-far, -0.02), (far, -0.02), (far, -1.0), (-far, -1.0)], GROUND)
-        canvas.bar((-self.track, 0.0), (self.track, 0.0), 0.04, STEEL)
-        for metre in range(-math.floor(self.track), math.floor(self.track) + 1):
-            canvas.bar((metre, -0.06), (metre, -0.16 if metre else -0.24), 0.02, STEEL)
-        for side in (-1, 1):
-            canvas.bar((side * (self.track + 0.34), 0.0), (side * (self.track + 0.34), 0.3), 0.07, INK)
-
-        pivot = (position, 0.3)
+        draw_track(canvas, self.track)
+        pivot = (position, JOINT_HEIGHT)
         for limit in (-self._largest_angle, self._largest_angle):
             # Dashed, to distinguish the limits from the pole.
             for dash in np.arange(0.15, 1.05, 0.12).tolist():
                 inner, outer = turned([(0.0, dash), (0.0, dash + 0.05)], -limit, pivot)
                 canvas.bar(inner, outer, 0.014, STEEL, rounded=False)
-        canvas.polygon(turned([(-0.3, 0.1), (0.3, 0.1), (0.3, 0.3), (-0.3, 0.3)], 0.0, (position, 0.0)), INK)
-        for wheel in (-0.18, 0.18):
-            canvas.circle((position + wheel, 0.09), 0.075, STEEL)
-            canvas.circle((position + wheel, 0.09), 0.03, INK)
-        canvas.bar(pivot, turned([(0.0, 2.0 * HALF_LENGTH)], -angle, pivot)[0], 0.075, BLUE)
-        canvas.circle(pivot, 0.06, SKY)
-        canvas.circle(pivot, 0.035, INK)
-        if self._push:
-            canvas.arrow((position, -0.36), (position + 0.75 * self._push, -0.36), 0.06, ORANGE)
+        draw_cart_pole(canvas, position, angle, self._push, 2.0 * STANDARD.half_length)
 
 
 class CartPoleEnv(_CartPoleEnv["int | np.integer[Any]"]):
@@ -340,10 +402,4 @@ class ContinuousCartPoleEnv(_CartPoleEnv["npt.NDArray[np.floating[Any]]"]):
         self.action_space = spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
 
     def _push_of(self, action: npt.NDArray[np.floating[Any]]) -> float:
-        try:
-            push = float(np.asarray(action).item())
-        except (TypeError, ValueError):
-            push = math.nan
-        if not math.isfinite(push):
-            raise ValueError(f"action must be one finite number in an array of shape (1,); got {action!r}")
-        return min(max(push, -1.0), 1.0)
+        return checked_push(action)

@@ -183,9 +183,7 @@ def make_outcome(point, action, n_points, model, outcomes, config, reward_functi
     :param places: work space, shape (2, obs_dim)
     """
     start = model.points[point]
-    reward, discount, unknown = _hold(
-        start, action, n_points, model, config, reward_function, state, outputs, places
-    )
+    reward, discount, unknown = _hold(start, action, n_points, model, config, reward_function, state, outputs, places)
     nearest, farthest = gaussian_neighbors(
         state,
         model.points,
@@ -221,9 +219,7 @@ def refresh_outcomes(n_points, n_others, first, model, outcomes, config, reward_
     for point in range(n_points):
         for action in range(n_actions):
             if model.stale[point, action] != FRESH:
-                make_outcome(
-                    point, action, n_points, model, outcomes, config, reward_function, state, outputs, places
-                )
+                make_outcome(point, action, n_points, model, outcomes, config, reward_function, state, outputs, places)
                 model.stale[point, action] = FRESH
     for _ in range(min(n_others, n_points)):
         first = first + 1 if first + 1 < n_points else 0
@@ -288,8 +284,7 @@ def iterate_values(values, best, n_points, known, outcomes, unknown_value, optim
                 after = 0.0
                 for successor in range(n_successors):
                     after += (
-                        outcomes.weights[point, action, successor]
-                        * best[outcomes.successors[point, action, successor]]
+                        outcomes.weights[point, action, successor] * best[outcomes.successors[point, action, successor]]
                     )
                 if optimistic:
                     after += outcomes.unknown[point, action] * max(unknown_value - after, 0.0)

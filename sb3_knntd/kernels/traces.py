@@ -255,13 +255,14 @@ def adopt(table, traces):
 @jit
 def overwrite(point, row, table, traces):
     """Set the values of a point to ``row``, shape (n_actions,), and drop its traces."""
-    place = find(point, traces.active_slots)
     table.values[row_of(point, table.row_slots)] = row
+    place = find(point, traces.active_slots)
     if place >= 0:
-        entries, n_envs = traces.active_entries, traces.active_entries.shape[2] - 2
-        entries[place, :, :n_envs] = 0.0
-        entries[place, :, n_envs] = 1.0
-        entries[place, :, n_envs + 1] = row
+        last = traces.n_active[0] - 1
+        traces.active_points[place] = traces.active_points[last]
+        traces.active_entries[place] = traces.active_entries[last]
+        traces.n_active[0] = last
+        rehash(traces.active_points, last, traces.active_slots)
 
 
 @jit

@@ -246,9 +246,11 @@ class Learner(ABC):
         """
         in_episodes = getattr(entry(state_dict, "entries"), "shape", None) == self.shape
         if in_episodes:
+            probabilities = checked_tensor(state_dict, "probabilities", self.shape[:2], th.float64, 0.0, 1.0 + ROUNDING)
+            # All zeros if it was saved outside of episodes. Then the rest is not used, and may be of dropped points.
+            in_episodes = bool(probabilities.any())
+        if in_episodes:
             self._check_state(state_dict)
-            # All zeros if it was saved outside of episodes.
-            in_episodes = bool(state_dict["probabilities"].any())
         self._forget()
         self.in_episodes = in_episodes
         if in_episodes:
@@ -267,8 +269,8 @@ class Learner(ABC):
         # Fewer than k points are followed by free rows.
         n_points, n_actions = max(self.perceiver.points.n_points, k), self.table.n_actions
         checked_tensor(state, "indices", (n_envs, k), th.int64, 0, n_points - 1)
-        probabilities = checked_tensor(state, "probabilities", (n_envs, k), th.float64, 0.0, 1.0 + ROUNDING)
-        if probabilities.any() and not ((probabilities.sum(dim=1) - 1.0).abs() <= ROUNDING).all():
+        probabilities = state["probabilities"]
+        if not ((probabilities.sum(dim=1) - 1.0).abs() <= ROUNDING).all():
             raise ValueError(f"probabilities must sum to 1 in every row; got {probabilities.sum(dim=1).tolist()}")
         checked_tensor(state, "entries", (n_envs, k, n_factors), th.int64, 0, n_actions - 1)
         checked_tensor(state, "held", (n_envs, n_factors), th.int64, UNDRAWN, n_actions - 1)

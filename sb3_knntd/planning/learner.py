@@ -158,9 +158,11 @@ class DynaLearner(Learner):
         table, values = self.table.entries().numpy(), np.empty((self.n_envs, self.table.n_actions))
         for env, observation in enumerate(self._observations):
             source = self.planner.optimistic if self._explores[env] else table
-            indices, probabilities = (each[0].numpy() for each in self.perceiver.perceive_one(observation))
-            # With fewer points than neighbours, the missing ones have probability 0.
-            values[env] = probabilities @ source[np.minimum(indices, len(source) - 1)]
+            # If the points are fewer than k, places without a point follow them.
+            indices, probabilities = (
+                each[0, : len(source)].numpy() for each in self.perceiver.perceive_one(observation)
+            )
+            values[env] = probabilities @ source[indices]
         self._columns[:] = pick_best(values, uniforms[:, 1])
         if self._is_box:
             self._vectors[:] = self.policy.columns.points[self._columns]

@@ -104,9 +104,7 @@ class StatePlanner(Planner):
         )
         tolerance = TOLERANCE * self.rewards.largest
         known = self.known
-        kernels.iterate_values(
-            self._values, self._best, n_states, known, outcomes, 0.0, False, tolerance, MOST_SWEEPS
-        )
+        kernels.iterate_values(self._values, self._best, n_states, known, outcomes, 0.0, False, tolerance, MOST_SWEEPS)
         hopeful = self.rewards.optimistic_value(settings.horizon, settings.optimism)
         share = 1.0 / (1.0 + self._tried)
         hopeful_outcomes = outcomes._replace(

@@ -14,12 +14,13 @@ from sb3_knntd.plots.grids import (
     telling_dims,
     value_grid,
 )
-from sb3_knntd.plots.model_maps import Rollout, plot_points, plot_rollout, roll_out
+from sb3_knntd.plots.model_maps import Rollout, plot_model_points, plot_rollout, roll_out
 from sb3_knntd.plots.names import NAMES, Names, check_names, names_for
 from sb3_knntd.plots.value_maps import (
     MOST_NAMED_ACTIONS,
     caption_of,
     count_panels,
+    plot_points,
     plot_routes,
     plot_value_function,
     plot_visits,
@@ -47,6 +48,7 @@ __all__ = [
     "names_for",
     "new_figure",
     "plot_learning_curve",
+    "plot_model_points",
     "plot_points",
     "plot_rollout",
     "plot_routes",

@@ -37,7 +37,7 @@ class Rollout(NamedTuple):
     known: np.ndarray
 
 
-def plot_points(
+def plot_model_points(
     model: KNNAlgorithm, dims: tuple[int, int] = (0, 1), axes: Axes | None = None, names: Names | None = None
 ) -> Axes:
     """

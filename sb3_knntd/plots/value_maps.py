@@ -32,7 +32,7 @@ def plot_value_function(
 ) -> tuple[Axes, ...]:
     """
     Plot V(s) = max_a Q(s, a) and the greedy action over two dimensions of the observations. Cells are grey where all k
-    nearest points have the initial value.
+    nearest points have the initial value. Points that grow are drawn as dots.
 
     :param model: a model with Box observations of at least two dimensions
     :param dims: the two dimensions, horizontal and vertical
@@ -69,6 +69,8 @@ def plot_value_function(
     for ax in axes:
         ax.set_xlabel(names.observations[grid.dims[0]])
         ax.set_facecolor(UNLEARNED_COLOR)
+        if model.policy.grows:
+            plot_points(model, grid.dims, ax)
     axes[0].set_ylabel(names.observations[grid.dims[1]])
     if not grid.learned.all():
         axes[0].annotate(
@@ -106,6 +108,22 @@ def plot_visits(counts: np.ndarray, extent: tuple[float, float, float, float], a
     figure_of(axes).colorbar(image, ax=axes, label="steps")
     axes.set_facecolor(UNLEARNED_COLOR)
     axes.set_title("Visits")
+    return axes
+
+
+def plot_points(model: KNNAlgorithm, dims: tuple[int, int], axes: Axes) -> Axes:
+    """
+    Plot the perception points as dots on top of the axes' content, those of all places in the other dimensions.
+
+    :param model: a model with Box observations of at least two dimensions
+    :param dims: the two dimensions, horizontal and vertical
+    :param axes: axes to draw on; their range does not change
+    :return: the same axes
+    """
+    range_x, range_y = axes.get_xlim(), axes.get_ylim()
+    points = model.policy.points.cpu().numpy()
+    axes.plot(points[:, dims[0]], points[:, dims[1]], ".", color="black", markersize=1.5, label="points")
+    axes.set(xlim=range_x, ylim=range_y)
     return axes
 
 

@@ -23,7 +23,7 @@ BASELINES: dict[str, type[spaces.Space[Any]]] = {
     **dict.fromkeys(("sac", "td3", "tqc", "ddpg", "crossq"), spaces.Box),
 }
 #: Those of RL Zoo's that are not shown by their names in capitals.
-BASELINE_LABELS = {"qrdqn": "QR-DQN"}
+BASELINE_LABELS = {"qrdqn": "QR-DQN", "crossq": "CrossQ"}
 #: Problems of gymnasium that environments of this package are forms of: what was tuned for those is good for these.
 RELATED = {
     "sb3_knntd/MountainCar-v0": "MountainCar-v0",
