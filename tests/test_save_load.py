@@ -15,14 +15,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from algorithms import ALGORITHMS
+from algorithms import ALGORITHMS, TD_ONLY, BoxDyna, fitting
 from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
-from toy_envs import DriftEnv, GridEnv
+from toy_envs import DriftEnv, GridEnv, PushEnv
 
 from sb3_knntd import KNNTD, ExA, KNNDyna
 
@@ -61,12 +61,25 @@ EXA_SETTINGS: dict[str, dict[str, Any]] = {
     "per neighbor": {"exploration": "per_neighbor", "exploration_initial_eps": 0.3},
     "other action points": {"action_points": [[-1.0, -0.13, 0.71, 0.9]]},
 }
+DYNA_SETTINGS: dict[str, dict[str, Any]] = {
+    "defaults": {},
+    "full": {"buffer_size": 110, "max_points": 40},
+    "schedules": {"learning_rate": LinearSchedule(0.8, 0.1, 1.0), "trace_decay": LinearSchedule(0.3, 0.9, 1.0)},
+    "half size": {"policy_kwargs": {"dtype": th.float32}},
+    "no seed": {"seed": None},
+    "the bounds of the space": {"bounds": None, "spacing": 0.03},
+}
 MODELS = pytest.mark.parametrize(
     ("algorithm", "settings"),
     [
         pytest.param(algorithm, settings, id=f"{algorithm.__name__}-{name}")
-        for algorithm, own in ((KNNTD, KNNTD_SETTINGS), (ExA, EXA_SETTINGS))
-        for name, settings in {**SETTINGS, **own}.items()
+        for algorithm, own in (
+            (KNNTD, SETTINGS | KNNTD_SETTINGS),
+            (ExA, SETTINGS | EXA_SETTINGS),
+            (KNNDyna, DYNA_SETTINGS),
+            (BoxDyna, DYNA_SETTINGS),
+        )
+        for name, settings in own.items()
     ],
 )
 
@@ -136,7 +149,7 @@ def test_interrupted_while_and_after_measuring(
     def make() -> VecEnv:
         return make_vec_env(cart_pole, 1)
 
-    arguments: dict[str, Any] = {"points": 3, "n_neighbors": 4, "seed": 1}
+    arguments = fitting(algorithm, {"points": 3, "n_neighbors": 4, "seed": 1})
     whole = algorithm(make(), **arguments).learn(first).learn(1400 - first, reset_num_timesteps=False)
     venv = make()
     algorithm(venv, **arguments).learn(first).save(tmp_path / "middle")
@@ -161,13 +174,18 @@ def test_interrupted_run_in_normalised_environments(
     "arguments",
     [
         {},
-        {"policy_kwargs": {"table": "hashed"}},
         {"policy_kwargs": {"dtype": th.float32}},
+        {"points": "grow", "spacing": 0.2},
+        {"policy_kwargs": {"table": "hashed"}, "search": "auto"},
         {"search": "kd_tree"},
         {"points": np.random.default_rng(0).uniform(-1.0, 1.0, (50, 2)), "search": "brute"},
     ],
 )
-def test_a_deep_copy_continues_independently(make_model: MakeModel, arguments: dict[str, Any]) -> None:
+def test_a_deep_copy_continues_independently(
+    algorithm: Algorithm, make_model: MakeModel, arguments: dict[str, Any]
+) -> None:
+    if issubclass(algorithm, KNNDyna) and not arguments.keys() <= {"policy_kwargs", "points", "spacing"}:
+        pytest.skip("KNNDyna has points of its own")
     # Stop in the middle of an episode.
     model = make_model(**arguments).learn(155)
     before, other = model.policy.q_table.clone(), copy.deepcopy(model)
@@ -237,7 +255,8 @@ def test_checkpoint_keeps_the_counters_of_the_log(
 ) -> None:
     def last_row(name: str) -> dict[str, float]:
         row = read_log(tmp_path / name)[-1]
-        return {key: value for key, value in row.items() if key not in ("time/fps", "time/time_elapsed")}
+        durations = ("time/fps", "time/time_elapsed", "train/planning_time")
+        return {key: value for key, value in row.items() if key not in durations}
 
     snapshot = Snapshot(at)
     whole = make_model(make_venv())
@@ -278,7 +297,7 @@ def test_measured_ranges_are_kept_without_the_environment(
 ) -> None:
     # Only the file contains the normalisation under which the ranges were measured.
     venv = VecNormalize(make_venv(2))
-    model = algorithm(venv, points=5, seed=0).learn(1200)
+    model = algorithm(venv, **fitting(algorithm, {"points": 5, "seed": 0})).learn(1200)
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model")
     seen = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
@@ -306,6 +325,7 @@ OWN_ARGUMENTS: dict[Algorithm, dict[str, Any]] = {
 }  # fmt: skip
 
 
+@TD_ONLY
 def test_arguments_are_kept(algorithm: Algorithm, make_model: MakeModel, tmp_path: pathlib.Path) -> None:
     given = {
         "learning_rate": 0.2, "gamma": 0.9, "trace_decay": 0.7, "n_neighbors": 3, "points": [5, 4], "bandwidth": 0.5,
@@ -318,6 +338,18 @@ def test_arguments_are_kept(algorithm: Algorithm, make_model: MakeModel, tmp_pat
     loaded = algorithm.load(tmp_path / "model")
     assert {name: getattr(loaded, name) for name in given} == given
     assert (loaded.policy.q_table == 2.0).all()
+
+
+def test_arguments_of_dyna_are_kept(tmp_path: pathlib.Path) -> None:
+    given = {
+        "learning_rate": 0.1, "gamma": 0.9, "trace_decay": 0.7, "buffer_size": 150, "spacing": 0.3, "max_points": 50,
+        "action_points": [[-1.0, 0.2, 1.0]], "simulated_steps": 7, "optimism": 0.5, "reward_function": None,
+        "verbose": 0, "seed": 7,
+    }  # fmt: skip
+    KNNDyna(PushEnv(), **given).learn(200).save(tmp_path / "model")
+    loaded = KNNDyna.load(tmp_path / "model")
+    assert {name: getattr(loaded, name) for name in given} == given
+    assert [points.tolist() for points in loaded.policy.action_points] == given["action_points"]
 
 
 # ---------------------------------------------------- other environments
@@ -421,8 +453,10 @@ def test_attributes_are_changed_on_load(
     make_model().learn(20).save(tmp_path / "model")
     model = algorithm.load(tmp_path / "model", env=make_venv(), learning_rate=0.0, verbose=0)
     before = model.policy.q_table.clone()
+    assert model.lr_schedule(1.0) == 0.0
     model.learn(50)
-    assert th.equal(model.policy.q_table, before)
+    if not issubclass(algorithm, KNNDyna):
+        assert th.equal(model.policy.q_table, before)
     replaced = algorithm.load(tmp_path / "model", custom_objects={"gamma": 0.5}, print_system_info=True)
     assert replaced.gamma == 0.5
 
@@ -568,7 +602,7 @@ def test_zip_without_one_of_its_parts(algorithm: Algorithm, saved: pathlib.Path,
 
 def test_file_of_another_algorithm(algorithm: Algorithm, tmp_path: pathlib.Path) -> None:
     DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "dqn")
-    with pytest.raises(ValueError, match=algorithm.__name__):
+    with pytest.raises(ValueError, match=algorithm._algorithm):
         algorithm.load(tmp_path / "dqn")
 
 
@@ -577,7 +611,7 @@ def test_file_of_another_algorithm_is_not_unpickled(
 ) -> None:
     DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}).save(tmp_path / "dqn")
     monkeypatch.setattr("stable_baselines3.common.save_util.json_to_data", interrupt)
-    with pytest.raises(ValueError, match=algorithm.__name__):
+    with pytest.raises(ValueError, match=algorithm._algorithm):
         algorithm.load(tmp_path / "dqn")
 
 

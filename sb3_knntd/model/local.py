@@ -172,6 +172,9 @@ class LocalModel:
         renumbered = self.buffer.drop(used)
         self.scale(0)
         kernels.renumber(renumbered, arrays, n)
+        # What is not in a list is no transition any more.
+        left = np.arange(arrays.nearest.shape[2]) < arrays.counts[:n, :, None]
+        arrays.nearest[:n][~left] = 0
 
     def fit(self) -> None:
         """Fit anew where lists have changed."""

@@ -101,6 +101,11 @@ class Perceiver(nn.Module):
         self.search_is_outside = self.arguments is not None and self.arguments.search == SearchKind.OUTSIDE
         self.version += 1
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        # A copy's search must share its arrays with the copy's arguments: points are added to them.
+        self._renew()
+
     def _make_arguments(self) -> PerceptionArguments | None:
         if not isinstance(self.weights, KernelWeights) or not self.bounds.low.is_cpu:
             return None

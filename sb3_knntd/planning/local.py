@@ -182,6 +182,8 @@ class LocalPlanner(Planner):
         self.model.lay(self._scaled_points(), policy.perceiver.bounds, float(self.points.spacing))
         self._extend(n_kept)
         self.outcomes.reaches[: self.model.n_points] = -1.0
+        # Until they are found anew, the successors must be points, also in a saved file.
+        self.outcomes.successors[:] = 0
 
     def _add_points(self, added: np.ndarray) -> None:
         if not len(added):
