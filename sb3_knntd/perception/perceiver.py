@@ -14,7 +14,7 @@ from sb3_knntd.kernels.perceive import PerceptionArguments, SearchKind, are_with
 from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.points import Lattice, Points, Scattered
 from sb3_knntd.perception.search import Neighbors, Search
-from sb3_knntd.perception.search.base import nearest_by_tensors
+from sb3_knntd.perception.search.tensors import nearest_by_tensors
 from sb3_knntd.perception.weights import KernelWeights, Weights
 
 
@@ -173,8 +173,7 @@ class Perceiver(nn.Module):
         :return: their perceptions
         """
         if is_traced():
-            places = self.points.coordinates(self.bounds)
-            indices, squared_distances = nearest_by_tensors(scaled, places, self.search.n_neighbors)
+            indices, squared_distances = nearest_by_tensors(scaled, self.points, self.bounds, self.search.n_neighbors)
         else:
             indices, squared_distances = self.search.query(scaled)
         weights = self.weights(squared_distances)

@@ -1,0 +1,94 @@
+"""Exact search with tensor operations alone, which can be traced and exported."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from itertools import islice
+
+import numpy as np
+import torch as th
+
+from sb3_knntd.perception.bounds import Bounds
+from sb3_knntd.perception.points import Lattice, Points
+from sb3_knntd.perception.search.base import Neighbors
+
+#: Largest number of points that are compared for each observation.
+MOST_CANDIDATES = 2**20
+
+
+def nearest_by_tensors(scaled: th.Tensor, points: Points, bounds: Bounds, k: int) -> Neighbors:
+    """
+    :param scaled: observations in scaled units, shape (batch, obs_dim)
+    :param points: the points
+    :param bounds: the range that is mapped to [-1, 1]
+    :param k: number of neighbours
+    :return: the first k by (squared distance, index)
+    :raises ValueError: if too many points of a lattice would have to be compared
+    """
+    ranks = candidate_ranks(points.shape, k) if isinstance(points, Lattice) else None
+    if ranks is not None:
+        assert isinstance(points, Lattice)
+        return _nearest_on_lattice(scaled, points, ranks, k)
+    places = points.coordinates(bounds)
+    distances = th.zeros_like(scaled[:, :1] * places[:, 0])
+    for dimension in range(places.shape[1]):
+        distances = distances + (scaled[:, dimension, None] - places[:, dimension]).square()
+    indices, nearest = [], []
+    for _ in range(k):
+        # argmin returns the first of several minima.
+        index = distances.argmin(dim=1, keepdim=True)
+        indices.append(index)
+        nearest.append(distances.gather(1, index))
+        distances = distances.scatter(1, index, th.inf)
+    return Neighbors(th.cat(indices, dim=1), th.cat(nearest, dim=1))
+
+
+def _nearest_on_lattice(scaled: th.Tensor, points: Lattice, ranks: np.ndarray, k: int) -> Neighbors:
+    total = th.zeros_like(scaled[:, :1])
+    number = th.zeros_like(total, dtype=th.int64)
+    for dimension, (size, axis) in enumerate(zip(points.shape, points.axis_tensors, strict=True)):
+        # A stable order: the lower of two coordinates at one distance comes first.
+        squares, order = (scaled[:, dimension, None] - axis.to(scaled.device)).square().sort(dim=1, stable=True)
+        # A list: torch warns of tensors that are made of arrays while it traces.
+        chosen = ranks[:, dimension].tolist()
+        total = total + squares[:, chosen]
+        number = number * size + order[:, chosen]
+    number, by_number = number.sort(dim=1)
+    distances, by_distance = total.gather(1, by_number).sort(dim=1, stable=True)
+    return Neighbors(number.gather(1, by_distance[:, :k]), distances[:, :k])
+
+
+@lru_cache(maxsize=16)
+def candidate_ranks(shape: Sequence[int], k: int) -> np.ndarray | None:
+    """
+    The points of a lattice that can be among the k nearest of any observation. In each dimension, the coordinates are
+    ranked by their distance from the observation. As many points are at least as near as a point as the product, over
+    the dimensions, of the number of ranks up to its own. Rounding can blur the order of two neighbouring ranks, which
+    lie on either side of the observation, so the rank before its own is not counted.
+
+    :param shape: number of points in each dimension
+    :param k: number of neighbours
+    :return: ranks in each dimension, counted from 0, shape (n_candidates, obs_dim), int64; ``None`` if that would be no
+        fewer than all points
+    :raises ValueError: if they are more than :data:`MOST_CANDIDATES`
+    """
+    n_points = math.prod(shape)
+    ranks = list(islice(_ranks(tuple(shape), k), min(n_points, MOST_CANDIDATES + 1)))
+    if len(ranks) > MOST_CANDIDATES:
+        raise ValueError(
+            f"tensor operations would have to compare more than {MOST_CANDIDATES} points of a lattice of {len(shape)} "
+            f"dimensions with each observation, for n_neighbors={k}: give fewer neighbours or dimensions, or export "
+            "the policy as 'c'"
+        )
+    return None if len(ranks) == n_points else np.array(ranks, dtype=np.int64).reshape(-1, len(shape))
+
+
+def _ranks(shape: tuple[int, ...], k: int) -> Iterator[tuple[int, ...]]:
+    if not shape:
+        yield ()
+        return
+    for rank in range(min(shape[0], k + 1)):
+        for others in _ranks(shape[1:], k // max(rank, 1)):
+            yield (rank, *others)
