@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import cloudpickle
@@ -19,6 +20,7 @@ from sb3_knntd.actions.selection import ActionSelector, MeanActionSelector, Mean
 from sb3_knntd.common.checks import check_flag, check_number, check_size, check_word, shown
 from sb3_knntd.common.interrupts import interrupts_held
 from sb3_knntd.common.tracing import is_traced
+from sb3_knntd.export import FrozenPolicy, export_policy
 from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.selection import Exploration, Target
 from sb3_knntd.kernels.traces import LARGEST_VALUE
@@ -352,6 +354,32 @@ class KNNPolicy(BasePolicy):
         """
         content = {"state_dict": self.state_dict(), "data": self._get_constructor_parameters()}
         th.save(content, path, pickle_module=cloudpickle)
+
+    def frozen(self) -> FrozenPolicy:
+        """
+        :return: what the policy does now, as plain numbers
+        """
+        selector = self._greedy_selector()
+        return FrozenPolicy.of(self.perceiver, self.table, selector, self.observation_space, self.action_space)
+
+    def export(
+        self, path: str | Path, format: str, *, test_vectors: str | Path | None = None, **options: Any
+    ) -> list[Path]:
+        """
+        Write the greedy policy in a form that needs neither this package nor, but for torch's own formats, Python.
+
+        :param path: file to write, with the format's suffix added if it has none
+        :param format: ``"c"``, ``"onnx"``, ``"torchscript"``, ``"torch_export"``, ``"safetensors"``, ``"csv"`` or
+            ``"npz"``, see :data:`sb3_knntd.export.FORMATS`
+        :param test_vectors: a further file, CSV, for random observations with their actions and values, to test the
+            exported policy with
+        :param options: of the format. ``"c"`` takes ``precision``, ``"double"`` or ``"float"``, and ``rows``, the rows of
+            the table to store: ``"changed"``, those that differ from the initial value, ``"all"``, or ``"auto"``
+        :return: the files written
+        :raises ValueError: if the format, or an option, is unknown, or the format cannot hold this policy
+        :raises ImportError: if the format needs a library that is not installed
+        """
+        return export_policy(self, path, format, test_vectors=test_vectors, **options)
 
     def parameters_to_vector(self) -> np.ndarray:
         """

@@ -19,7 +19,7 @@ LAYERS = (
     ("kernels", "envs", "registry", "distributed", "online_algorithm"),
     ("perception", "q_table"),
     ("actions",),
-    ("learners", "filters"),
+    ("learners", "filters", "export"),
     ("policies", "saving"),
     ("base",),
     ("knntd", "exa"),
