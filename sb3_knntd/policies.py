@@ -448,6 +448,7 @@ class ExAPolicy(KNNPolicy):
         self._action_shape = None if len(action_space.shape) == 1 else (-1, *action_space.shape)
         # Rounding can move a mean beyond its terms by a few units in the last place of a float64. In float32 it cannot.
         self._can_exceed = action_space.dtype != np.float32
+        self._column_actions = th.from_numpy(columns.points)
         self._action_bounds = [th.from_numpy(bound) for bound in (action_space.low, action_space.high)]
 
     @property
@@ -484,13 +485,16 @@ class ExAPolicy(KNNPolicy):
 
     def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         points = self.columns.points[action_indices].sum(axis=2)
-        return self.fit_actions((probabilities[..., None] * points).sum(axis=1))
+        # Summed one after the other, as in the kernels: a mean that is exactly between two whole actions can fall on
+        # either side otherwise.
+        return self.fit_actions((probabilities[..., None] * points).cumsum(axis=1)[:, -1])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         rows, probabilities = self._exact_rows(observation)
-        actions = self.selector.actions_of(self.selector.greedy_indices(rows, probabilities), probabilities)
-        # Like fit_actions, but with torch operations that can be traced.
+        points = self._column_actions.to(probabilities)[self.selector.greedy_indices(rows, probabilities)].sum(dim=2)
+        # Like _recommended and fit_actions, but with torch operations that can be traced.
+        actions = (probabilities[..., None] * points).cumsum(dim=1)[:, -1]
         if self._actions_are_whole:
             actions = actions.round()
         low, high = (bound.to(actions.device) for bound in self._action_bounds)

@@ -157,3 +157,54 @@ def test_c_acts_like_predict(model: KNNTD | ExA, compiler: str, tmp_path: Path) 
         # A double that is rounded to the dtype of the action space.
         np.testing.assert_allclose(actions, expected, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(values, model.policy.q_values(observations).numpy(), rtol=1e-6, atol=1e-6)
+
+
+# ------------------------------------------------------------------- ONNX
+
+
+def test_onnx_acts_like_predict(model: KNNTD | ExA, tmp_path: Path) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    observations = observations_of(model)
+    (path,) = model.policy.export(tmp_path / "policy", "onnx")
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    actions, values = session.run(None, {"observation": observations})
+    expected = model.predict(observations, deterministic=True)[0]
+    assert actions.dtype == expected.dtype
+    assert actions.shape == expected.shape
+    if isinstance(model, KNNTD):
+        np.testing.assert_array_equal(actions, expected)
+    else:
+        np.testing.assert_allclose(actions, expected, rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(values, model.policy.q_values(observations).numpy(), rtol=1e-6, atol=1e-6)
+    singles = [session.run(["action"], {"observation": observations[i : i + 1]})[0] for i in range(100)]
+    np.testing.assert_array_equal(np.concatenate(singles), actions[:100])
+
+
+# ------------------------------------------------------------------ torch
+
+
+def acts(program: Callable[[th.Tensor], th.Tensor], model: KNNTD | ExA, n: int = 2_000) -> None:
+    """Check that a program acts like a model on a batch, and on single observations."""
+    observations = observations_of(model, n)
+    expected = model.predict(observations, deterministic=True)[0]
+    actions = program(th.from_numpy(observations)).numpy()
+    assert actions.dtype == expected.dtype
+    assert actions.shape == expected.shape
+    if isinstance(model, KNNTD):
+        np.testing.assert_array_equal(actions, expected)
+    else:
+        np.testing.assert_allclose(actions, expected, rtol=1e-7, atol=1e-12)
+    for i in range(20):
+        np.testing.assert_array_equal(program(th.from_numpy(observations[i : i + 1])).numpy(), actions[i : i + 1])
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")
+def test_torchscript_acts_like_predict(model: KNNTD | ExA, tmp_path: Path) -> None:
+    (path,) = model.policy.export(tmp_path / "policy", "torchscript")
+    acts(th.jit.load(path), model)
+
+
+def test_torch_export_acts_like_predict(model: KNNTD | ExA, tmp_path: Path) -> None:
+    (path,) = model.policy.export(tmp_path / "policy", "torch_export")
+    acts(th.export.load(path).module(), model)

@@ -12,6 +12,8 @@ from typing import Any
 from sb3_knntd.common.checks import check_path, check_word
 from sb3_knntd.export.c99 import write_c
 from sb3_knntd.export.frozen import Exportable, FrozenPolicy
+from sb3_knntd.export.onnx_graph import write_onnx
+from sb3_knntd.export.torch_programs import write_torch_export, write_torchscript
 from sb3_knntd.export.vectors import write_test_vectors
 
 __all__ = ["FORMATS", "Exportable", "Format", "FrozenPolicy", "export_policy"]
@@ -43,6 +45,9 @@ class Format:
 #: The formats by name.
 FORMATS: dict[str, Format] = {
     "c": Format(".c", write_c, "C99, a header and a source, for controllers"),
+    "onnx": Format(".onnx", write_onnx, "ONNX, for onnxruntime and others", "onnx"),
+    "torchscript": Format(".pt", write_torchscript, "TorchScript, for torch in Python and C++"),
+    "torch_export": Format(".pt2", write_torch_export, "torch.export, for torch"),
 }
 
 

@@ -174,8 +174,10 @@ class Perceiver(nn.Module):
         """
         if is_traced():
             indices, squared_distances = nearest_by_tensors(scaled, self.points, self.bounds, self.search.n_neighbors)
-        else:
-            indices, squared_distances = self.search.query(scaled)
+            weights = self.weights(squared_distances)
+            # Added one after the other, as in the kernels, so that both are rounded in the same way.
+            return Perception(indices, weights / weights.cumsum(dim=1)[:, -1:])
+        indices, squared_distances = self.search.query(scaled)
         weights = self.weights(squared_distances)
         return Perception(indices, weights / weights.sum(dim=1, keepdim=True))
 

@@ -49,15 +49,30 @@ def _nearest_on_lattice(scaled: th.Tensor, points: Lattice, ranks: np.ndarray, k
     total = th.zeros_like(scaled[:, :1])
     number = th.zeros_like(total, dtype=th.int64)
     for dimension, (size, axis) in enumerate(zip(points.shape, points.axis_tensors, strict=True)):
-        # A stable order: the lower of two coordinates at one distance comes first.
-        squares, order = (scaled[:, dimension, None] - axis.to(scaled.device)).square().sort(dim=1, stable=True)
+        x = scaled[:, dimension, None]
         # A list: torch warns of tensors that are made of arrays while it traces.
         chosen = ranks[:, dimension].tolist()
+        width, reach = window(size, max(chosen))
+        first = ((x + 1.0) * (0.5 * (size - 1))).floor() - reach
+        near = first.clamp(0, size - width).long() + th.arange(width, device=x.device)
+        # A stable order: the lower of two coordinates at one distance comes first.
+        squares, order = (x - axis.to(x.device)[near]).square().sort(dim=1, stable=True)
         total = total + squares[:, chosen]
-        number = number * size + order[:, chosen]
+        number = number * size + near.gather(1, order[:, chosen])
     number, by_number = number.sort(dim=1)
     distances, by_distance = total.gather(1, by_number).sort(dim=1, stable=True)
     return Neighbors(number.gather(1, by_distance[:, :k]), distances[:, :k])
+
+
+def window(size: int, highest_rank: int) -> tuple[int, int]:
+    """
+    :param size: number of coordinates of a dimension
+    :param highest_rank: of a coordinate by its distance from an observation, counted from 0
+    :return: the number of neighbouring coordinates that all up to this rank are among, and by how many the first of them
+        is below the last coordinate up to the observation, if no end of the dimension is near. One more on either side
+        allows for rounding
+    """
+    return min(size, 2 * highest_rank + 5), highest_rank + 2
 
 
 @lru_cache(maxsize=16)
