@@ -13,6 +13,8 @@ from sb3_knntd.common.checks import check_path, check_word
 from sb3_knntd.export.c99 import write_c
 from sb3_knntd.export.frozen import Exportable, FrozenPolicy
 from sb3_knntd.export.onnx_graph import write_onnx
+from sb3_knntd.export.shared import write_safetensors
+from sb3_knntd.export.tables import write_csv, write_npz
 from sb3_knntd.export.torch_programs import write_torch_export, write_torchscript
 from sb3_knntd.export.vectors import write_test_vectors
 
@@ -48,6 +50,9 @@ FORMATS: dict[str, Format] = {
     "onnx": Format(".onnx", write_onnx, "ONNX, for onnxruntime and others", "onnx"),
     "torchscript": Format(".pt", write_torchscript, "TorchScript, for torch in Python and C++"),
     "torch_export": Format(".pt2", write_torch_export, "torch.export, for torch"),
+    "safetensors": Format(".safetensors", write_safetensors, "the whole policy, to share", "safetensors"),
+    "csv": Format(".csv", write_csv, "points and values, for spreadsheets and MATLAB"),
+    "npz": Format(".npz", write_npz, "points and values as arrays, for NumPy"),
 }
 
 
@@ -67,8 +72,10 @@ def export_policy(
     """
     check_word("format", format, FORMATS)
     kind = FORMATS[format]
-    for option in options:
-        check_word(f"the options of format {format!r}", option, kind.options)
+    unknown = [option for option in options if option not in kind.options]
+    if unknown:
+        known = " and ".join(map(repr, kind.options)) or "none"
+        raise ValueError(f"format={format!r} has no option {unknown[0]!r}; its options: {known}")
     target = check_path("path", path)
     if not target.suffix:
         target = target.with_name(f"{target.name}{kind.suffix}")

@@ -8,6 +8,7 @@ from importlib.metadata import version
 from math import prod
 from pathlib import Path
 from string import Template
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -20,7 +21,10 @@ from sb3_knntd.kernels.selection import Combination
 from sb3_knntd.perception.bounds import FARTHEST
 
 #: C's floating types by the name of the option, the suffix of their constants and functions, and NumPy's type.
-PRECISIONS = {"double": ("double", "", np.float64), "float": ("float", "f", np.float32)}
+PRECISIONS: dict[str, tuple[str, str, type[np.floating[Any]]]] = {
+    "double": ("double", "", np.float64),
+    "float": ("float", "f", np.float32),
+}
 #: The weight of a squared distance ``square``, where ``nearest`` is the smallest one, see
 #: :func:`sb3_knntd.kernels.perceive.weigh`.
 WEIGHTS = {
@@ -418,8 +422,8 @@ def write_c(policy: Exportable, path: Path, *, precision: str = "double", rows: 
     :param policy: the policy
     :param path: the source or the header; the other is written beside it
     :param precision: floating type of the table and of all computations, ``"double"`` or ``"float"``
-    :param rows: the rows to store: ``"all"``; ``"changed"``, those that differ from the initial value, whose numbers are
-        searched; or ``"auto"``, what takes less memory
+    :param rows: the rows to store: ``"all"``; ``"changed"``, those that differ from the initial value, whose numbers
+        are searched; or ``"auto"``, what takes less memory
     :return: both files
     :raises ValueError: if the weights are a function, or a number is too large for a float
     """
@@ -522,9 +526,11 @@ class _Code:
                     f"void {self.name}_action({observation},\n"
                     f"{' ' * (len(self.name) + 13)}{self.name}_real action[{self.name.upper()}_ACTION_SIZE])"
                 )
-        real, index = np.dtype(self.type).itemsize, {"int": 4, "long": 8, "long long": 8}[self.index]
+        # As on a computer of 64 bits, where a pointer and a long have 8 bytes.
+        real, index = np.dtype(self.type).itemsize, 4 if self.index == "int" else 8
         table = self.values.size * real + (0 if self.row_points is None else len(self.row_points) * index)
-        stack = frozen.n_neighbors * (8 + real + index) + frozen.obs_dim * (3 * real + 4 * index) + frozen.n_columns * real
+        searched = frozen.n_neighbors * (8 + real + index) + frozen.obs_dim * (3 * real + 4 * index)
+        stack = searched + frozen.n_columns * real
         return self.fill(
             HEADER,
             ranges=ranges,

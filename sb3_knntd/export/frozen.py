@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,7 +64,7 @@ class FrozenPolicy:
     :param weights: weights of the neighbours by distance
     :param values: rows of the table, shape (n_rows, n_columns), the table's dtype
     :param row_points: the point of each row, ascending, shape (n_rows,), int64; ``None`` if row i is that of point i
-    :param visited: whether each row has been updated by learning, shape (n_rows,), bool
+    :param visits: for each row, 0 if learning has not updated it, shape (n_rows,), int32
     :param initial_value: value of points without a row
     :param combination: whether the mean of the rows selects one action, or each row one, whose mean is taken
     :param columns: the actions that the columns of the table stand for
@@ -79,7 +80,7 @@ class FrozenPolicy:
     weights: Weights
     values: np.ndarray
     row_points: np.ndarray | None
-    visited: np.ndarray
+    visits: np.ndarray
     initial_value: float
     combination: Combination
     columns: ActionColumns
@@ -104,12 +105,12 @@ class FrozenPolicy:
         bounds, points = perceiver.bounds, perceiver.points
         lattice = points if isinstance(points, Lattice) else None
         with table.lock:
-            values, visited = (tensor.cpu().numpy().copy() for tensor in (table.entries(), table.visits()))
+            values, visits = (tensor.cpu().numpy().copy() for tensor in (table.entries(), table.counts()))
             rows = table.points()
             if rows is not None:
                 numbers = rows.numpy()
                 order = np.argsort(numbers)
-                numbers, values, visited = numbers[order], values[order], visited[order]
+                numbers, values, visits = numbers[order], values[order], visits[order]
             return cls(
                 observation_space=observation_space,
                 action_space=action_space,
@@ -117,11 +118,11 @@ class FrozenPolicy:
                 high=bounds.high.cpu().numpy().copy(),
                 lattice=lattice,
                 places=None if lattice else points.coordinates(bounds).cpu().numpy(),
-                n_neighbors=perceiver.search.n_neighbors,
+                n_neighbors=min(perceiver.search.n_neighbors, points.n_points),
                 weights=perceiver.weights,
                 values=values,
                 row_points=None if rows is None else numbers,
-                visited=visited,
+                visits=visits,
                 initial_value=table.initial_value,
                 combination=Combination(selector.kernel_arguments(greedy=True).combination),
                 columns=selector.columns,
@@ -154,7 +155,7 @@ class FrozenPolicy:
     def factor_ranges(self) -> list[tuple[int, int]]:
         """The first column of each action factor, and the one after its last."""
         ends = self.columns.factors.tolist()
-        return list(zip(ends[:-1], ends[1:], strict=True))
+        return list(pairwise(ends))
 
     def kernel_weights(self, format: str) -> tuple[Weighting, float]:
         """
@@ -165,8 +166,8 @@ class FrozenPolicy:
         if not isinstance(self.weights, KernelWeights):
             raise ValueError(
                 f"weights: a function of Python cannot be written as {format!r}; give a named one, "
-                f"{', '.join(repr(kind.name.lower()) for kind in Weighting)}, or export to 'torchscript', which records "
-                "functions of torch operations"
+                f"{', '.join(repr(kind.name.lower()) for kind in Weighting)}, or export to 'torchscript' or "
+                "'torch_export', which record functions of torch operations"
             )
         return self.weights.WEIGHTING, self.weights.bandwidth
 
@@ -197,6 +198,25 @@ class FrozenPolicy:
         every[self.row_points] = self.values
         return every
 
+    def scaled_points(self, numbers: np.ndarray | None = None) -> np.ndarray:
+        """
+        :param numbers: points, shape (n,), int64; all by default
+        :return: their coordinates, scaled units, shape (n, obs_dim)
+        """
+        numbers = np.arange(self.n_points) if numbers is None else numbers
+        if self.lattice is None:
+            assert self.places is not None
+            return self.places[numbers]
+        indices = np.unravel_index(numbers, self.lattice.shape)
+        return np.stack([axis[index] for axis, index in zip(self.lattice.axes, indices, strict=True)], axis=1)
+
+    def row_places(self) -> np.ndarray:
+        """
+        :return: the point of each row, observation units, shape (n_rows, obs_dim)
+        """
+        places: np.ndarray = self.low + 0.5 * (self.scaled_points(self.row_points) + 1.0) * (self.high - self.low)
+        return places
+
     def sample_observations(self, n: int, seed: int = 0) -> np.ndarray:
         """
         :param n: number of observations
@@ -209,7 +229,8 @@ class FrozenPolicy:
             margin = BEYOND * (self.high - self.low)
             drawn = random.uniform(self.low - margin, self.high + margin, (n, self.obs_dim))
             drawn = np.clip(drawn, space.low, space.high)
-            return (np.rint(drawn) if np.issubdtype(space.dtype, np.integer) else drawn).astype(space.dtype)
+            observations: np.ndarray = np.rint(drawn) if np.issubdtype(space.dtype, np.integer) else drawn
+            return observations.astype(space.dtype)
         first, counts = count_states(space)
-        drawn = first + (random.uniform(size=(n, self.obs_dim)) * counts).astype(np.int64)
-        return drawn.reshape((n, *(space.shape or ()))).astype(space.dtype)
+        states: np.ndarray = first + (random.uniform(size=(n, self.obs_dim)) * counts).astype(np.int64)
+        return states.reshape((n, *(space.shape or ()))).astype(space.dtype)

@@ -14,7 +14,6 @@ from sb3_knntd.common.files import replace_file
 from sb3_knntd.export.frozen import Exportable, FrozenPolicy
 from sb3_knntd.kernels.perceive import Weighting
 from sb3_knntd.kernels.selection import Combination
-from sb3_knntd.perception import Bounds
 from sb3_knntd.perception.bounds import FARTHEST
 from sb3_knntd.perception.search.tensors import candidate_ranks, window
 
@@ -51,9 +50,7 @@ def write_onnx(policy: Exportable, path: Path) -> list[Path]:
     nodes = [*graph.nodes]
     for source, name in ((actions, "action"), (q_values, "q_values")):
         nodes.append(onnx.helper.make_node("Identity", [source], [name]))
-    values_info = onnx.helper.make_tensor_value_info(
-        "q_values", onnx.TensorProto.DOUBLE, ["batch", frozen.n_columns]
-    )
+    values_info = onnx.helper.make_tensor_value_info("q_values", onnx.TensorProto.DOUBLE, ["batch", frozen.n_columns])
     made = onnx.helper.make_graph(
         nodes,
         "sb3_knntd_policy",
@@ -146,11 +143,9 @@ def _nearest(graph: _Graph, frozen: FrozenPolicy, scaled: str) -> tuple[str, str
     lattice, k = frozen.lattice, frozen.n_neighbors
     ranks = None if lattice is None else candidate_ranks(lattice.shape, k)
     if lattice is None or ranks is None:
-        places = frozen.places if lattice is None else _coordinates(frozen)
-        assert places is not None
-        columns = graph.many(frozen.obs_dim, "Split", scaled, axis=1)
-        constants = (graph.constant(place[None]) for place in places.T)
-        distances = graph.total([graph.square_of_difference(*pair) for pair in zip(columns, constants, strict=True)])
+        constants = [graph.constant(column[None]) for column in frozen.scaled_points().T]
+        pairs = zip(graph.many(frozen.obs_dim, "Split", scaled, axis=1), constants, strict=True)
+        distances = graph.total([graph.square_of_difference(*pair) for pair in pairs])
         nearest, points = graph.first(distances, k)
         return points, nearest
     sums, number = [], graph.constant(0, np.int64)
@@ -172,13 +167,6 @@ def _nearest(graph: _Graph, frozen: FrozenPolicy, scaled: str) -> tuple[str, str
     number, by_number = graph.first(number, len(ranks))
     nearest, by_distance = graph.first(graph("GatherElements", graph.total(sums), by_number, axis=1), k)
     return graph("GatherElements", number, by_distance, axis=1), nearest
-
-
-def _coordinates(frozen: FrozenPolicy) -> np.ndarray:
-    """All points of a lattice, scaled units."""
-    assert frozen.lattice is not None
-    coordinates: np.ndarray = frozen.lattice.coordinates(Bounds(frozen.low, frozen.high)).numpy()
-    return coordinates
 
 
 def _shares(graph: _Graph, frozen: FrozenPolicy, squares: str) -> list[str]:

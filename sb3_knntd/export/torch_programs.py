@@ -49,8 +49,8 @@ class ReadTable(nn.Module):
 
 def write_torchscript(policy: Exportable, path: Path) -> list[Path]:
     """
-    Write a program for ``torch.jit.load``, in Python and C++. It takes a batch of observations and returns actions, both
-    in the shape and dtype of the spaces.
+    Write a program for ``torch.jit.load``, in Python and C++. It takes a batch of observations and returns actions,
+    both in the shape and dtype of the spaces.
 
     :param policy: the policy
     :param path: file to write

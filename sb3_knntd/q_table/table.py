@@ -117,9 +117,9 @@ class QTable(nn.Module, ABC):
         """
 
     @abstractmethod
-    def visits(self) -> th.Tensor:
+    def counts(self) -> th.Tensor:
         """
-        :return: whether each row of :meth:`entries` has been updated by learning, shape (n_rows,), bool
+        :return: for each row of :meth:`entries`, 1 if learning has updated it, otherwise 0, shape (n_rows,), int32
         """
 
     @abstractmethod
@@ -269,7 +269,7 @@ class DenseTable(QTable):
 
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
-            old, was_visited = self.entries(), self.visits()
+            old, was_visited = self.entries(), self._visits()
             values, visited = th.empty_like(old), th.zeros_like(self.visited)
             for points in th.arange(len(old), device=old.device).split(BATCH):
                 sources = regridding.sources(points)
@@ -291,7 +291,11 @@ class DenseTable(QTable):
                 self.values = self.values.new_full((n_points, self.n_actions), self.initial_value)
                 self.visited = self._no_visits(n_points).to(self.values.device)
 
-    def visits(self) -> th.Tensor:
+    def counts(self) -> th.Tensor:
+        return self._visits().int()
+
+    def _visits(self) -> th.Tensor:
+        """Whether each row has been updated by learning, shape (n_points,), bool."""
         bits = th.arange(8, device=self.visited.device, dtype=th.uint8)
         return ((self.visited[:-1, None] >> bits) & 1).bool().flatten()[: len(self.values)]
 
@@ -383,8 +387,8 @@ class HashedTable(QTable):
             self._write_back()
             return self.values[: self.n_visited]
 
-    def visits(self) -> th.Tensor:
-        return th.ones(self.n_visited, dtype=th.bool)
+    def counts(self) -> th.Tensor:
+        return th.ones(self.n_visited, dtype=th.int32)
 
     def points(self) -> th.Tensor:
         return self._rows.points[: self.n_visited]
@@ -392,9 +396,9 @@ class HashedTable(QTable):
     def rows(self, indices: th.Tensor) -> th.Tensor:
         if is_traced():
             raise ValueError(
-                "a policy with a hashed table cannot be traced or exported by torch's own functions: its rows are found "
-                "by compiled code. Call model.policy.export(path, 'torchscript') or (path, 'torch_export') instead, or "
-                "make the model with policy_kwargs={'table': 'dense'}"
+                "a policy with a hashed table cannot be traced or exported by torch's own functions: its rows are "
+                "found by compiled code. Call model.policy.export(path, 'torchscript') or (path, 'torch_export') "
+                "instead, or make the model with policy_kwargs={'table': 'dense'}"
             )
         return super().rows(indices)
 

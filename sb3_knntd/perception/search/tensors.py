@@ -68,9 +68,9 @@ def window(size: int, highest_rank: int) -> tuple[int, int]:
     """
     :param size: number of coordinates of a dimension
     :param highest_rank: of a coordinate by its distance from an observation, counted from 0
-    :return: the number of neighbouring coordinates that all up to this rank are among, and by how many the first of them
-        is below the last coordinate up to the observation, if no end of the dimension is near. One more on either side
-        allows for rounding
+    :return: the number of neighbouring coordinates that all up to this rank are among, and by how many the first of
+        them is below the last coordinate up to the observation, if no end of the dimension is near. One more on either
+        side allows for rounding
     """
     return min(size, 2 * highest_rank + 5), highest_rank + 2
 
