@@ -428,8 +428,9 @@ def write_c(policy: Exportable, path: Path, *, precision: str = "double", rows: 
     :raises ValueError: if the weights are a function, or a number is too large for a float
     """
     check_word("precision", precision, PRECISIONS)
-    source, header = path.with_suffix(".c"), path.with_suffix(".h")
-    code = _Code(policy.frozen(), path.stem, precision, rows)
+    stem = path.stem if path.suffix in (".c", ".h") else path.name
+    source, header = path.with_name(f"{stem}.c"), path.with_name(f"{stem}.h")
+    code = _Code(policy.frozen(), stem, precision, rows)
     replace_file(header, code.header().encode())
     replace_file(source, code.source(header.name).encode())
     return [source, header]
