@@ -20,7 +20,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import BaseCallback
 from toy_envs import DriftEnv, GridEnv, PushEnv
 
-from sb3_knntd import KNNTD, ExA, ExAPolicy, load_policy
+from sb3_knntd import KNNTD, ExA, ExAPolicy, KNNPolicy, load_policy
 from sb3_knntd.actions.exploration import EpsilonGreedy
 from sb3_knntd.actions.selection import MeanValueSelector
 from sb3_knntd.cli import main
@@ -220,6 +220,41 @@ def test_c_is_safe_with_any_number(name: str, tmp_path: Path) -> None:
     assert np.isfinite(values).all()
     low, high = (0, 2**31) if isinstance(model, KNNTD) else (model.action_space.low, model.action_space.high)
     assert ((actions >= low) & (actions <= high)).all()
+
+
+@needs_compiler
+def test_many_dimensions_are_for_c(tmp_path: Path) -> None:
+    """Tensor operations compare all points that could be near; C goes through them as far as it must."""
+    if not jit.AVAILABLE:
+        pytest.skip("hashed tables need numba")
+    space = spaces.Box(-1.0, 1.0, (12,), np.float32)
+    policy = KNNPolicy(space, spaces.Discrete(3), points=10)
+    observations = policy.frozen().sample_observations(300)
+    observations[:50] = 0.0  # the middle of a cell, as far from each of its 2^12 corners
+    rows = policy.perceive(observations).indices[:, ::3].unique()
+    values = th.from_numpy(np.random.default_rng(0).normal(size=(len(rows), 3)))
+    policy.load_state_dict({**policy.state_dict(), "table.row_points": rows, "table.values": values})
+    expected, _ = policy.predict(observations)
+    assert len(np.unique(expected)) == 3
+    source, _ = policy.export(tmp_path / "policy", "c")
+    np.testing.assert_array_equal(run_c(source, observations, COMPILERS[0], "-O2")[0][:, 0], expected)
+    with pytest.raises(ValueError, match=r"lattice of 12 dimensions .* Export the policy as 'c'"):
+        policy.export(tmp_path / "policy", "torchscript")
+
+
+@needs_compiler
+def test_the_program_in_the_docs_runs(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
+    model = KNNTD("MountainCar-v0", points=20, seed=0).learn(500)
+    source, _ = model.policy.export(tmp_path / "mountain_car", "c")
+    main = tmp_path / "main.c"
+    main.write_text(page.partition("```c\n")[2].partition("```")[0])
+    subprocess.run(
+        [COMPILERS[0], *STRICT, str(main), str(source), "-lm", "-o", str(tmp_path / "controller")], check=True
+    )
+    told = subprocess.run([tmp_path / "controller"], capture_output=True, check=True, text=True).stdout
+    action, _ = model.predict(np.array([-0.5, 0.02], np.float32), deterministic=True)
+    assert told.startswith(f"action {action} of values ")
 
 
 @needs_compiler

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
-from itertools import islice
 
 import numpy as np
 import torch as th
@@ -76,7 +75,7 @@ def window(size: int, highest_rank: int) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=16)
-def candidate_ranks(shape: Sequence[int], k: int) -> np.ndarray | None:
+def candidate_ranks(shape: tuple[int, ...], k: int) -> np.ndarray | None:
     """
     The points of a lattice that can be among the k nearest of any observation. In each dimension, the coordinates are
     ranked by their distance from the observation. As many points are at least as near as a point as the product, over
@@ -89,18 +88,28 @@ def candidate_ranks(shape: Sequence[int], k: int) -> np.ndarray | None:
         fewer than all points
     :raises ValueError: if they are more than :data:`MOST_CANDIDATES`
     """
-    n_points = math.prod(shape)
-    ranks = list(islice(_ranks(tuple(shape), k), min(n_points, MOST_CANDIDATES + 1)))
-    if len(ranks) > MOST_CANDIDATES:
+    n_candidates, n_points = _count_ranks(shape, k), math.prod(shape)
+    if n_candidates > MOST_CANDIDATES:
         raise ValueError(
-            f"tensor operations would have to compare more than {MOST_CANDIDATES} points of a lattice of {len(shape)} "
-            f"dimensions with each observation, for n_neighbors={k}: give fewer neighbours or dimensions, or export "
-            "the policy as 'c'"
+            f"points: with n_neighbors={k}, tensor operations would have to compare {n_candidates:.3g} points of a "
+            f"lattice of {len(shape)} dimensions with each observation. Export the policy as 'c', or make it with "
+            "fewer neighbours"
         )
-    return None if len(ranks) == n_points else np.array(ranks, dtype=np.int64).reshape(-1, len(shape))
+    if n_candidates == n_points:
+        return None
+    return np.array(list(_ranks(shape, k)), dtype=np.int64).reshape(-1, len(shape))
+
+
+@lru_cache(maxsize=4096)
+def _count_ranks(shape: tuple[int, ...], k: int) -> int:
+    """The number of :func:`_ranks`."""
+    if not shape:
+        return 1
+    return sum(_count_ranks(shape[1:], k // max(rank, 1)) for rank in range(min(shape[0], k + 1)))
 
 
 def _ranks(shape: tuple[int, ...], k: int) -> Iterator[tuple[int, ...]]:
+    """All ranks, in each dimension, whose product is at most k, where a rank of 0 counts as 1."""
     if not shape:
         yield ()
         return
