@@ -1,4 +1,4 @@
-"""The code that policies are written in as C: templates for :class:`string.Template`, filled in by the format's module."""
+"""The C code of policies: templates for :class:`string.Template`, which :mod:`sb3_knntd.export.c99` fills in."""
 
 from __future__ import annotations
 
