@@ -81,7 +81,7 @@ def test_export_prints_and_stores_its_table(tmp_path: pathlib.Path) -> None:
     for row, printed in zip(rows, done.stdout.splitlines()[2:], strict=False):
         assert printed.startswith(f"| {row['policy']} | {row['options']} | {row['nanoseconds']:,.0f} | ")
         assert f"| {row['policy']} | {row['options']} | " in page
-        assert 0 < row["size"]
+        assert row["size"] > 0
         assert 0.0 < row["nanoseconds"] < row["predict"]
 
 
