@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import cloudpickle
@@ -16,9 +17,12 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_knntd.actions.columns import ActionColumns, discrete_columns, make_action_columns
 from sb3_knntd.actions.exploration import EpsilonGreedy
 from sb3_knntd.actions.selection import ActionSelector, MeanActionSelector, MeanValueSelector, mean_rows
-from sb3_knntd.common.checks import check_flag, check_number, check_size, check_word, shown
+from sb3_knntd.common.checks import check_flag, check_number, check_path, check_size, check_word, shown
 from sb3_knntd.common.interrupts import interrupts_held
+from sb3_knntd.common.plain import loaded_class
 from sb3_knntd.common.tracing import is_traced
+from sb3_knntd.export import FrozenPolicy, export_policy
+from sb3_knntd.export.shared import read_safetensors
 from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.selection import Exploration, Target
 from sb3_knntd.kernels.traces import LARGEST_VALUE
@@ -424,6 +428,32 @@ class KNNPolicy(BasePolicy):
         content = {"state_dict": self.state_dict(), "data": self._get_constructor_parameters()}
         th.save(content, path, pickle_module=cloudpickle)
 
+    def frozen(self) -> FrozenPolicy:
+        """
+        :return: what the policy does now, as plain numbers
+        """
+        selector = self._greedy_selector()
+        return FrozenPolicy.of(self.perceiver, self.table, selector, self.observation_space, self.action_space)
+
+    def export(
+        self, path: str | Path, format: str, *, test_vectors: str | Path | None = None, **options: Any
+    ) -> list[Path]:
+        """
+        Write the greedy policy in a form that needs neither this package nor, but for torch's own formats, Python.
+
+        :param path: file to write, with the format's suffix added if it has none
+        :param format: ``"c"``, ``"onnx"``, ``"torchscript"``, ``"torch_export"``, ``"safetensors"``, ``"csv"`` or
+            ``"npz"``, see :data:`sb3_knntd.export.FORMATS`
+        :param test_vectors: a further file, CSV, for random observations with their actions and values, to test the
+            exported policy with
+        :param options: of the format. ``"c"`` takes ``precision``, ``"double"`` or ``"float"``, and ``rows``, the rows
+            of the table to store: ``"changed"``, those that differ from the initial value, ``"all"``, or ``"auto"``
+        :return: the files written
+        :raises ValueError: if the format, or an option, is unknown, or the format cannot hold this policy
+        :raises ImportError: if the format needs a library that is not installed
+        """
+        return export_policy(self, path, format, test_vectors=test_vectors, **options)
+
     def parameters_to_vector(self) -> np.ndarray:
         """
         :return: the entries of :attr:`q_table`, row by row, shape (n_points * n_actions,), the table's dtype
@@ -527,7 +557,9 @@ class ExAPolicy(KNNPolicy):
 
     def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         points = self.columns.points[action_indices].sum(axis=2)
-        return self.fit_actions((probabilities[..., None] * points).sum(axis=1))
+        # Summed one after the other, as in the kernels: a mean that is exactly between two whole actions can fall on
+        # either side otherwise.
+        return self.fit_actions((probabilities[..., None] * points).cumsum(axis=1)[:, -1])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
@@ -539,3 +571,29 @@ class ExAPolicy(KNNPolicy):
         low, high = (bound.to(actions.device) for bound in self._action_bounds)
         fitting = actions.to(low.dtype).reshape(-1, *low.shape)
         return th.minimum(th.maximum(fitting, low), high) if self._can_exceed else fitting
+
+
+def load_policy(path: str | Path, device: th.device | str = "cpu") -> KNNPolicy:
+    """
+    Read a policy that was exported as ``"safetensors"``. Nothing from the file is executed or imported, so it may come
+    from anyone.
+
+    :param path: the file
+    :param device: device of the perception and the table
+    :return: the policy, to predict with and to look into. To learn on from it, make a model with the same points, and
+        call ``model.policy.load_state_dict(policy.state_dict())``
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if it is damaged, or holds no policy of this package
+    :raises ImportError: if safetensors is not installed
+    """
+    name, arguments, tensors = read_safetensors(check_path("path", path))
+    kind = loaded_class(name, KNNPolicy)
+    if any(callable(value) for value in arguments.values()):
+        raise ValueError(f"{path}: an argument of the policy is a class, which nothing but a number or a word can be")
+    try:
+        policy: KNNPolicy = kind(**arguments)
+        policy.load_state_dict(tensors)
+    except (TypeError, AssertionError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{path} holds no valid policy: {error}") from error
+    policy.set_training_mode(False)
+    return policy.to(device)

@@ -106,7 +106,8 @@ class SavedAlgorithm(OnlineAlgorithm):
 
         SB3's format contains pickled objects, and unpickling executes code from the file, so load only files from
         sources that you trust. With ``trusted=False`` nothing is unpickled: spaces, SB3's schedules, arrays and numbers
-        are read from the data that :meth:`save` adds to the file.
+        are read from the data that :meth:`save` adds to the file. To share what was learned,
+        ``model.policy.export(path, "safetensors")`` writes a file without pickled objects.
 
         :param path: file, or file-like object
         :param env: environment to continue with, ``None`` to predict only. The number of environments may differ from

@@ -362,6 +362,11 @@ class MeanActionSelector(ActionSelector):
         points = self._points.to(probabilities)
         return (probabilities[..., None] * points[action_indices].sum(dim=2)).sum(dim=1)
 
+    def greedy_actions(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        points = self._points.to(probabilities)[self.greedy_indices(rows, probabilities)].sum(dim=2)
+        # Added one after the other, as in the kernels, so that both are rounded in the same way.
+        return (probabilities[..., None] * points).cumsum(dim=1)[:, -1]
+
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
         vectors, points = np.asarray(actions, dtype=np.float64), self.columns.points
         if vectors.ndim != 2 or vectors.shape[1] != points.shape[1] or not np.isfinite(vectors).all():

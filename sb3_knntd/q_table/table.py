@@ -52,6 +52,8 @@ class QTable(nn.Module, ABC):
         #: incremented whenever arrays have been replaced or set to other values
         self.version = 0
         self.traces = ActiveTraces(n_actions, n_envs=1, capacity=0)
+        #: the traces when ``values`` was last brought up to date
+        self._written = b""
 
     def __getstate__(self) -> dict[str, Any]:
         # A lock cannot be copied or pickled.
@@ -101,6 +103,7 @@ class QTable(nn.Module, ABC):
         if self.traces.count:
             with self.lock:
                 write_back(self.arrays(), self.traces.arrays)
+                self._written = self.traces.snapshot()
 
     def forget_traces(self) -> None:
         """Drop all traces and the values of the entries with a trace."""
@@ -111,6 +114,12 @@ class QTable(nn.Module, ABC):
     def entries(self) -> th.Tensor:
         """
         :return: all rows, up to date, shape (n_rows, n_actions)
+        """
+
+    @abstractmethod
+    def counts(self) -> th.Tensor:
+        """
+        :return: for each row of :meth:`entries`, 1 if learning has updated it, otherwise 0, shape (n_rows,), int32
         """
 
     @abstractmethod
@@ -235,6 +244,11 @@ class DenseTable(QTable):
         return None
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
+        if is_traced() and self.traces.count and self._written != self.traces.snapshot():
+            raise ValueError(
+                "the table has been learned into since its tensor was last brought up to date, and what is traced or "
+                "exported now would be of before: call model.policy.eval() first"
+            )
         if is_traced() or not self.traces.count:
             with self.lock:
                 return self.values[indices]
@@ -275,6 +289,9 @@ class DenseTable(QTable):
                 self.forget_traces()
                 self.values = self.values.new_full((n_points, self.n_actions), self.initial_value)
                 self.visited = self._no_visits(n_points).to(self.values.device)
+
+    def counts(self) -> th.Tensor:
+        return self._visits().int()
 
     def _visits(self) -> th.Tensor:
         """Whether each row has been updated by learning, shape (n_points,), bool."""
@@ -486,15 +503,18 @@ class HashedTable(QTable):
             self._write_back()
             return self.values[: self.n_visited]
 
+    def counts(self) -> th.Tensor:
+        return th.ones(self.n_visited, dtype=th.int32)
+
     def points(self) -> th.Tensor:
         return self._rows.points[: self.n_visited]
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
         if is_traced():
             raise ValueError(
-                "a policy with a hashed table cannot be traced or exported: its rows are found by compiled code. Make "
-                "the model with policy_kwargs={'table': 'dense'}, and fewer points if it would not fit; predict works "
-                "with every table"
+                "a policy with a hashed table cannot be traced or exported by torch's own functions: its rows are "
+                "found by compiled code. Call model.policy.export(path, 'torchscript') or (path, 'torch_export') "
+                "instead, or make the model with policy_kwargs={'table': 'dense'}"
             )
         return super().rows(indices)
 
