@@ -266,11 +266,20 @@ class KNNAlgorithm(SavedAlgorithm):
     def _make_learner(self) -> Learner:
         policy, config = self.policy, self._update_config()
         if policy.is_compiled:
-            return CompiledLearner(policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config)
+            return CompiledLearner(
+                policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config, policy.experience
+            )
         assert isinstance(policy.table, DenseTable)
         one_step = self.trace_decay == 0.0
         return TorchLearner(
-            policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config, one_step=one_step
+            policy.perceiver,
+            policy.table,
+            policy.selector,
+            self._stream,
+            self.n_envs,
+            config,
+            policy.experience,
+            one_step=one_step,
         )
 
     def _update_config(self) -> UpdateConfig:

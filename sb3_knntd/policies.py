@@ -23,7 +23,7 @@ from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.selection import Exploration, Target
 from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.compiled import GreedyReader
-from sb3_knntd.perception import Lattice, Perception, PerceptionConfig, Points, make_perceiver
+from sb3_knntd.perception import Experience, Lattice, Perception, PerceptionConfig, Points, make_perceiver
 from sb3_knntd.perception.search import SEARCHES
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.q_table import DenseTable, HashedTable, QTable
@@ -94,6 +94,8 @@ class KNNPolicy(BasePolicy):
         }
         self.perceiver = make_perceiver(perception, observation_space, bounds_from_space=bounds_from_space)
         self.n_neighbors = self.perceiver.search.n_neighbors
+        #: statistics of the steps that were learned from
+        self.experience = Experience(self.perceiver.bounds.obs_dim)
         self._compilable = compiled and jit.AVAILABLE and isinstance(self.perceiver.weights, KernelWeights)
         if compiled and not jit.AVAILABLE:
             warnings.warn(
@@ -177,6 +179,14 @@ class KNNPolicy(BasePolicy):
         ``set_parameters``.
         """
         return self.table.entries()
+
+    @property
+    def visits(self) -> th.Tensor:
+        """
+        The number of learning steps that have updated each of :attr:`points` as one of the k nearest, up to 2³⁰, shape
+        (n_points,), int32. Updates along the traces are not counted.
+        """
+        return self.table.counts()
 
     def widen(self, observations: th.Tensor) -> None:
         """

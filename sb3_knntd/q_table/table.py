@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_knntd.common.state_checks import checked_points, checked_tensor
 from sb3_knntd.common.tracing import is_traced
-from sb3_knntd.kernels.traces import TableArrays, read_rows, rehash, write_back
+from sb3_knntd.kernels.traces import MOST_VISITS, TableArrays, read_rows, rehash, write_back
 from sb3_knntd.q_table.active_traces import ActiveTraces, make_slots
 
 #: Number of points whose values are carried over at a time.
@@ -114,6 +114,19 @@ class QTable(nn.Module, ABC):
         """
 
     @abstractmethod
+    def counts(self) -> th.Tensor:
+        """
+        :return: the number of learning steps that have updated each row, up to 2³⁰, shape (n_rows,), int32
+        """
+
+    @abstractmethod
+    def counts_at(self, indices: th.Tensor) -> th.Tensor:
+        """
+        :param indices: points, any shape, int64
+        :return: the number of learning steps that have updated each, the same shape, int32
+        """
+
+    @abstractmethod
     def points(self) -> th.Tensor | None:
         """
         :return: the point of each row, shape (n_rows,), int64; ``None`` if row i is that of point i
@@ -195,37 +208,31 @@ class DenseTable(QTable):
     :param dtype: floating type of the entries
     """
 
-    visited: th.Tensor
+    visits: th.Tensor
 
     def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
         self.register_buffer("values", th.full((n_points, n_actions), self.initial_value, dtype=dtype))
-        self.register_buffer("visited", self._no_visits(n_points))
-
-    @staticmethod
-    def _no_visits(n_points: int) -> th.Tensor:
-        """A bit for each row: whether it has been updated by learning; and one spare byte at the end."""
-        return th.zeros((n_points + 7) // 8 + 1, dtype=th.uint8)
+        self.register_buffer("visits", th.zeros(n_points, dtype=th.int32))
 
     @property
     def n_visited(self) -> int:
-        return int(np.unpackbits(self.visited.cpu().numpy()[:-1]).sum())
+        return int((self.visits > 0).sum())
 
     def visit(self, indices: th.Tensor) -> None:
         """
-        Mark points as visited.
+        Count a learning step that updates these points.
 
-        :param indices: point indices, any shape, int64
+        :param indices: point indices, any shape, int64; a point that is named twice is updated by two steps
         """
-        self._visit(self.visited, indices)
+        points = indices.reshape(-1)
+        self.visits.index_add_(0, points, (self.visits[points] < MOST_VISITS).int())
 
-    @staticmethod
-    def _visit(visited: th.Tensor, indices: th.Tensor) -> None:
-        byte, bit = indices.reshape(-1) >> 3, indices.reshape(-1) & 7
-        for each in range(8):
-            # Concurrent writes to a byte write the same value; points with another bit write to the spare byte.
-            at = th.where(bit == each, byte, len(visited) - 1)
-            visited[at] = visited[at] | (1 << each)
+    def counts(self) -> th.Tensor:
+        return self.visits
+
+    def counts_at(self, indices: th.Tensor) -> th.Tensor:
+        return self.visits[indices]
 
     def entries(self) -> th.Tensor:
         self._write_back()
@@ -246,24 +253,21 @@ class DenseTable(QTable):
     def add_rows(self, values: th.Tensor) -> None:
         with self.lock:
             self.drop_traces()
-            n_points = len(self.values) + len(values)
             grown = th.cat((self.values, values.to(self.values)))
-            visited = self._no_visits(n_points).to(self.values.device)
-            visited[: len(self.visited) - 1] = self.visited[:-1]
-            self.values, self.visited = grown, visited
+            self.values, self.visits = grown, th.cat((self.visits, self.visits.new_zeros(len(values))))
             self.version += 1
 
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
-            old, was_visited = self.entries(), self._visits()
-            values, visited = th.empty_like(old), th.zeros_like(self.visited)
+            old = self.entries()
+            values, visits = th.empty_like(old), th.empty_like(self.visits)
             for points in th.arange(len(old), device=old.device).split(BATCH):
                 sources = regridding.sources(points)
                 values[points] = self._carried(old[sources[0]], sources)
-                self._visit(visited, points[was_visited[sources[0][:, 0]]])
+                visits[points] = self.visits[sources[0][:, 0]]
             self.forget_traces()
             self.values.copy_(values)
-            self.visited.copy_(visited)
+            self.visits.copy_(visits)
 
     def resize(self, n_points: int) -> None:
         """
@@ -275,17 +279,12 @@ class DenseTable(QTable):
             with self.lock:
                 self.forget_traces()
                 self.values = self.values.new_full((n_points, self.n_actions), self.initial_value)
-                self.visited = self._no_visits(n_points).to(self.values.device)
-
-    def _visits(self) -> th.Tensor:
-        """Whether each row has been updated by learning, shape (n_points,), bool."""
-        bits = th.arange(8, device=self.visited.device, dtype=th.uint8)
-        return ((self.visited[:-1, None] >> bits) & 1).bool().flatten()[: len(self.values)]
+                self.visits = self.visits.new_zeros(n_points)
 
     def arrays(self) -> TableArrays:
         return TableArrays(
             values=self.values.numpy(),
-            visited=self.visited.numpy(),
+            visits=self.visits.numpy(),
             row_points=np.empty(0, np.int64),
             row_slots=np.empty((0, 2), np.int64),
             n_rows=np.zeros(1, np.int64),
@@ -302,8 +301,21 @@ class DenseTable(QTable):
             # Missing tensors and wrong shapes are reported by torch.
             if prefix + "values" in state_dict:
                 checked_tensor(state_dict, prefix + "values", (None, None))
+            state_dict = _counted(state_dict, prefix, len(self.visits))
             self.forget_traces()
             super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _counted(state_dict: Any, prefix: str, n_points: int) -> Any:
+    """The state with checked visits. Versions that did not count them saved a bit for each point: one visit or none."""
+    state = dict(state_dict)
+    bits = state.pop(prefix + "visited", None)
+    if isinstance(bits, th.Tensor) and bits.dtype == th.uint8:
+        visited = np.unpackbits(bits.cpu().numpy(), bitorder="little")[:n_points]
+        state.setdefault(prefix + "visits", th.from_numpy(visited.astype(np.int32)))
+    if prefix + "visits" in state:
+        checked_tensor(state, prefix + "visits", (None,), th.int32, 0)
+    return state
 
 
 class _Rows(NamedTuple):
@@ -312,12 +324,14 @@ class _Rows(NamedTuple):
 
     :param values: shape (capacity, n_actions)
     :param points: the point of each row, shape (capacity,), int64
+    :param visits: the number of learning steps that have updated each row, shape (capacity,), int32
     :param slots: hash from points to rows
     :param n_used: number of rows in use, shape (1,), int64
     """
 
     values: th.Tensor
     points: th.Tensor
+    visits: th.Tensor
     slots: np.ndarray
     n_used: np.ndarray
 
@@ -340,19 +354,21 @@ class HashedTable(QTable):
         self.n_points = n_points
         no_points, no_values = th.empty(0, dtype=th.int64), th.empty((0, n_actions), dtype=dtype)
         # Replaced as a whole, so that an interruption leaves all rows unchanged.
-        self._rows = self._made_of(no_points, no_values, self.SMALLEST)
+        self._rows = self._made_of(no_points, no_values, th.empty(0, dtype=th.int32), self.SMALLEST)
 
-    def _made_of(self, points: th.Tensor, values: th.Tensor, capacity: int) -> _Rows:
+    def _made_of(self, points: th.Tensor, values: th.Tensor, visits: th.Tensor, capacity: int) -> _Rows:
         """Allocate ``capacity`` rows and fill the first ones."""
         n = len(points)
         rows = _Rows(
             th.full((capacity, self.n_actions), self.initial_value, dtype=values.dtype),
             th.full((capacity,), -1, dtype=th.int64),
+            th.zeros(capacity, dtype=th.int32),
             make_slots(capacity),
             np.array([n]),
         )
         rows.values[:n] = values
         rows.points[:n] = points
+        rows.visits[:n] = visits
         rehash(rows.points.numpy(), n, rows.slots)
         return rows
 
@@ -369,6 +385,16 @@ class HashedTable(QTable):
         with self.lock:
             self._write_back()
             return self.values[: self.n_visited]
+
+    def counts(self) -> th.Tensor:
+        return self._rows.visits[: self.n_visited]
+
+    def counts_at(self, indices: th.Tensor) -> th.Tensor:
+        if not self.n_visited:
+            return th.zeros_like(indices, dtype=th.int32)
+        points, order = self.points().sort()
+        nearest = th.searchsorted(points, indices.contiguous()).clamp(max=len(points) - 1)
+        return self.counts()[order[nearest]] * (points[nearest] == indices)
 
     def points(self) -> th.Tensor:
         return self._rows.points[: self.n_visited]
@@ -387,7 +413,7 @@ class HashedTable(QTable):
         if len(rows.values) - n >= n_points:
             return False
         capacity = max(2 * len(rows.values), n + n_points)
-        self._rows = self._made_of(rows.points[:n], rows.values[:n], capacity)
+        self._rows = self._made_of(rows.points[:n], rows.values[:n], rows.visits[:n], capacity)
         return True
 
     def add_rows(self, values: th.Tensor) -> None:
@@ -396,23 +422,25 @@ class HashedTable(QTable):
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
             points = th.cat([regridding.targets(part) for part in self.points().split(BATCH)]).unique()
-            values = th.cat([self._carried(self.rows(s[0]), s) for s in map(regridding.sources, points.split(BATCH))])
-            self._refill(points, values)
+            sources = [regridding.sources(part) for part in points.split(BATCH)]
+            values = th.cat([self._carried(self.rows(each[0]), each) for each in sources])
+            visits = th.cat([self.counts_at(each[0][:, 0]) for each in sources])
+            self._refill(points, values, visits)
 
     def arrays(self) -> TableArrays:
         rows = self._rows
         return TableArrays(
             values=rows.values.numpy(),
-            visited=np.empty(0, np.uint8),
+            visits=rows.visits.numpy(),
             row_points=rows.points.numpy(),
             row_slots=rows.slots,
             n_rows=rows.n_used,
             initial_value=self.initial_value,
         )
 
-    def _refill(self, points: th.Tensor, values: th.Tensor) -> None:
+    def _refill(self, points: th.Tensor, values: th.Tensor, visits: th.Tensor) -> None:
         """Replace all rows by these."""
-        rows = self._made_of(points, values, max(self.SMALLEST, len(points)))
+        rows = self._made_of(points, values, visits, max(self.SMALLEST, len(points)))
         self.forget_traces()
         self._rows = rows
 
@@ -428,9 +456,14 @@ class HashedTable(QTable):
         with self.lock:
             destination[prefix + "values"] = self.entries().clone()
             destination[prefix + "row_points"] = self.points().clone()
+            destination[prefix + "row_visits"] = self.counts().clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         with self.lock:
             points = checked_points(state_dict, prefix + "row_points", self.n_points)
             values = checked_tensor(state_dict, prefix + "values", (len(points), self.n_actions))
-            self._refill(points, values.to(self.values.dtype))
+            # Versions that did not count visits did not save them, and every row was visited.
+            visits = th.ones(len(points), dtype=th.int32)
+            if prefix + "row_visits" in state_dict:
+                visits = checked_tensor(state_dict, prefix + "row_visits", (len(points),), th.int32, 0)
+            self._refill(points, values.to(self.values.dtype), visits)
