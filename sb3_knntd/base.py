@@ -33,6 +33,7 @@ from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.schedules import check_rate, constant_of, make_schedule
 from sb3_knntd.common.transitions import check_transition
+from sb3_knntd.insight import Inspectable
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.learners import CompiledLearner, Learner, Rates, TorchLearner
@@ -46,7 +47,7 @@ NONE_TRUNCATED: dict[int, np.ndarray] = {}
 LARGEST_SEED = 2**32 - 1
 
 
-class KNNAlgorithm(SavedAlgorithm):
+class KNNAlgorithm(Inspectable, SavedAlgorithm):
     """
     Base class of the algorithms of this package: parameters, policy, learner, and measuring of unbounded dimensions.
 

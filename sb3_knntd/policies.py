@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import cloudpickle
 import numpy as np
@@ -12,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.actions.columns import ActionColumns, discrete_columns, make_action_columns
 from sb3_knntd.actions.exploration import EpsilonGreedy
@@ -394,6 +395,17 @@ class KNNPolicy(BasePolicy):
             "action_space": self.action_space,
             **self._arguments,
         }
+
+
+class TableModel(Protocol):
+    """A model whose policy is a table: what pictures and explanations are made from."""
+
+    policy: KNNPolicy
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+
+    def get_env(self) -> VecEnv | None:
+        """The environment; ``None`` if there is none."""
 
 
 class ExAPolicy(KNNPolicy):

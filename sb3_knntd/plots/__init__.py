@@ -14,7 +14,7 @@ from sb3_knntd.plots.grids import (
     telling_dims,
     value_grid,
 )
-from sb3_knntd.plots.names import NAMES, Names, check_names, names_for
+from sb3_knntd.plots.names import NAMES, Names, check_names, names_for, names_in
 from sb3_knntd.plots.value_maps import (
     MOST_NAMED_ACTIONS,
     caption_of,
@@ -43,6 +43,7 @@ __all__ = [
     "count_panels",
     "figure_of",
     "names_for",
+    "names_in",
     "new_figure",
     "plot_learning_curve",
     "plot_routes",

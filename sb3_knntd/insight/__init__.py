@@ -1,0 +1,10 @@
+"""What a model has learned and why it acts as it does: explanations, diagnoses, and a page for the browser."""
+
+from __future__ import annotations
+
+from sb3_knntd.insight.diagnosis import Diagnosis, Finding, diagnose
+from sb3_knntd.insight.explanation import Explanation, explain
+from sb3_knntd.insight.inspectable import Inspectable
+from sb3_knntd.insight.page import write_page
+
+__all__ = ["Diagnosis", "Explanation", "Finding", "Inspectable", "diagnose", "explain", "write_page"]
