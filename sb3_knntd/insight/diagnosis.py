@@ -169,7 +169,7 @@ def diagnose(model: Inspectable, names: Names | None = None) -> Diagnosis:
     ======================== =========================================================================================
     ``diverging``            values are far beyond the returns that the rewards allow
     ``beyond_bounds``        more than 5 % of the observations are beyond the bounds of a dimension
-    ``unused_range``         the observations span less than a tenth of the bounds of a dimension: few points are visited
+    ``unused_range``         the observations span less than a tenth of a dimension's bounds: few points are visited
     ``constant_dimension``   all observations are the same in a dimension
     ``useless_dimension``    the values hardly depend on a dimension
     ``initial_values``       the values of most visits are still the initial ones
@@ -328,8 +328,8 @@ def _too_coarse(case: _Case) -> Iterator[Finding]:
             "points",
             float(moves[dim]),
             f"from one point to the next takes {1 / moves[dim]:,.0f} steps even along {case.names.observations[dim]}, "
-            "the fastest dimension, so that the points hardly tell the steps apart. Give more points, or hold each action "
-            "for several steps",
+            "the fastest dimension, so that the points hardly tell the steps apart. Give more points, or hold each "
+            "action for several steps",
             (dim,),
         )
 

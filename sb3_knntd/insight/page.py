@@ -76,8 +76,8 @@ def write_page(
 ) -> None:
     """
     Write a page that shows what a model has learned: value, greedy action and visits over any two dimensions, with
-    sliders for all, the neighbours of a state that is clicked, and the findings of :func:`diagnose`. It is one file that
-    needs no network.
+    sliders for all, the neighbours of a state that is clicked, and the findings of :func:`diagnose`. It is one file
+    that needs no network.
 
     :param model: the model
     :param path: the file to write, replaced as a whole
@@ -181,10 +181,11 @@ def _table(policy: KNNPolicy) -> dict[str, Any]:
         numbers = table.points()
         points = np.arange(len(values)) if numbers is None else numbers.cpu().numpy()
     told = (visits > 0) | (values != table.initial_value).any(axis=1)
-    if told.sum() * values.shape[1] > MOST_VALUES:
+    n_values = int(told.sum()) * values.shape[1]
+    if n_values > MOST_VALUES:
         raise ValueError(
-            f"a page can show up to {MOST_VALUES:,} action values; this table has {told.sum() * values.shape[1]:,}. Draw "
-            "it with sb3_knntd.plots.plot_value_function"
+            f"a page can show up to {MOST_VALUES:,} action values; this table has {n_values:,}. Draw it with "
+            "sb3_knntd.plots.plot_value_function"
         )
     return {
         "rows": _encoded(points[told].astype(np.float64)),
