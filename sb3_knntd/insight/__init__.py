@@ -5,6 +5,16 @@ from __future__ import annotations
 from sb3_knntd.insight.diagnosis import Diagnosis, Finding, diagnose
 from sb3_knntd.insight.explanation import Explanation, explain
 from sb3_knntd.insight.inspectable import Inspectable
-from sb3_knntd.insight.page import write_page
+from sb3_knntd.insight.page import Episodes, read_monitor, write_page
 
-__all__ = ["Diagnosis", "Explanation", "Finding", "Inspectable", "diagnose", "explain", "write_page"]
+__all__ = [
+    "Diagnosis",
+    "Episodes",
+    "Explanation",
+    "Finding",
+    "Inspectable",
+    "diagnose",
+    "explain",
+    "read_monitor",
+    "write_page",
+]

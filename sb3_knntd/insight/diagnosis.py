@@ -17,15 +17,17 @@ if TYPE_CHECKING:
     from sb3_knntd.insight.inspectable import Inspectable
 
 #: After fewer steps nothing is said.
-LEAST_STEPS = 2_000
+LEAST_STEPS = 5_000
 #: Share of the observations beyond the bounds of a dimension.
 MOST_BEYOND = 0.05
-#: Share of the bounds of a dimension that the observations span.
-LEAST_SPAN = 0.1
+#: Share of the bounds of a dimension that the observations span. With fewer steps, a beginner may not have got far.
+LEAST_SPAN, STEPS_FOR_SPAN = 0.1, 10_000
 #: Median number of updates of a visited point.
 LEAST_VISITS = 2
 #: Share of the visits to points whose greedy action was never tried, or whose values never changed.
-MOST_UNTRIED = 0.4
+MOST_UNTRIED = 0.3
+#: How much of the way from the attainable returns to the initial value the values still are.
+MOST_OPTIMISM = 0.2
 #: Steps that a state takes to move from one point to the next along the fastest dimension.
 MOST_STEPS_PER_POINT = 50
 #: ε at the end of training.
@@ -98,9 +100,10 @@ class Diagnosis(Sequence[Finding]):
             f"{self.n_steps:,} steps, {self.n_visited:,} of {self.n_points:,} points visited "
             f"({self.n_visited / self.n_points:.1%}), each {self.visits:,.0f} times (median)"
         )
-        if self.n_steps < LEAST_STEPS:
-            return f"{facts}\nToo few steps for a diagnosis: it takes {LEAST_STEPS:,}."
-        return "\n".join([facts, *(f"- {finding}" for finding in self)]) if self else f"{facts}\nNothing was found."
+        if self:
+            return "\n".join([facts, *(f"- {finding}" for finding in self)])
+        few = f"Too few steps for a diagnosis: it takes {LEAST_STEPS:,}."
+        return f"{facts}\n{few if self.n_steps < LEAST_STEPS else 'Nothing was found.'}"
 
 
 class _Case:
@@ -146,6 +149,14 @@ class _Case:
         spacing: np.ndarray = np.where(gaps > 0, (self.high - self.low) / np.maximum(gaps, 1), np.inf)
         return spacing
 
+    @property
+    def attainable(self) -> tuple[float, float]:
+        """The lowest and the highest return of endless episodes with the rewards that were seen."""
+        gamma, n_steps = float(self.model.gamma), self.experience.n_steps
+        horizon = n_steps if gamma == 1.0 else min(n_steps, 1.0 / (1.0 - gamma))
+        lowest, highest = self.experience.rewards
+        return lowest * horizon, highest * horizon
+
     @cached_property
     def factors(self) -> list[np.ndarray]:
         """The values of the visited points for each action factor, shape (n, n_columns)."""
@@ -173,8 +184,8 @@ def diagnose(model: Inspectable, names: Names | None = None) -> Diagnosis:
     ``constant_dimension``   all observations are the same in a dimension
     ``useless_dimension``    the values hardly depend on a dimension
     ``initial_values``       the values of most visits are still the initial ones
-    ``untried_actions``      for more than 40 % of the visits the greedy action was never tried: the optimism of the
-                             initial value is not used up
+    ``optimism``             for more than 30 % of the visits the greedy action was never tried, or the values are still
+                             above all returns that the rewards allow: the initial value is not used up
     ``too_coarse``           a state takes more than 50 steps to move from one point of the lattice to the next
     ``too_fine``             most visited points were updated only once
     ``saturated``            most values are the worst ones that γ allows
@@ -183,24 +194,22 @@ def diagnose(model: Inspectable, names: Names | None = None) -> Diagnosis:
 
     :param model: the model
     :param names: names of the dimensions and actions; by default those of the environment, or numbers
-    :return: the findings; none after fewer than 2,000 steps
+    :return: the findings; after fewer than 5,000 steps ``diverging`` only
     :raises ValueError: if ``names`` do not fit
     """
     case = _Case(model, names_for(model, names))
     n_steps = case.experience.n_steps
-    enough = n_steps >= LEAST_STEPS and len(case.visits) > 0
-    findings = [finding for check in CHECKS for finding in check(case)] if enough else []
+    # Values that diverge need no more steps to be certain of.
+    checks = CHECKS if n_steps >= LEAST_STEPS else (_diverging,)
+    findings = [finding for check in checks for finding in check(case)] if n_steps and len(case.visits) else []
     median = float(np.median(case.visits)) if len(case.visits) else 0.0
     n_points = model.policy.perceiver.points.n_points
     return Diagnosis(tuple(findings), n_steps, n_points, len(case.visits), median)
 
 
 def _diverging(case: _Case) -> Iterator[Finding]:
-    lowest, highest = case.experience.rewards
-    gamma, n_steps = float(case.model.gamma), case.experience.n_steps
-    horizon = n_steps if gamma == 1.0 else min(n_steps, 1.0 / (1.0 - gamma))
-    initial = case.policy.table.initial_value
-    least, most = min(0.0, initial, lowest * horizon), max(0.0, initial, highest * horizon)
+    initial, (lowest, highest) = case.policy.table.initial_value, case.attainable
+    least, most = min(0.0, initial, lowest), max(0.0, initial, highest)
     excess = max(float(case.values.max()) - most, least - float(case.values.min()), 0.0)
     if excess > MOST_EXCESS * max(most - least, 1e-300):
         yield Finding(
@@ -227,7 +236,7 @@ def _beyond_bounds(case: _Case) -> Iterator[Finding]:
 
 
 def _unused_range(case: _Case) -> Iterator[Finding]:
-    if not case.has_range:
+    if not case.has_range or case.experience.n_steps < STEPS_FOR_SPAN:
         return
     # With two points or fewer every observation uses all of them.
     several = case.spacing < (case.high - case.low) / 1.5
@@ -300,7 +309,7 @@ def _initial_values(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _untried_actions(case: _Case) -> Iterator[Finding]:
+def _optimism(case: _Case) -> Iterator[Finding]:
     initial = case.policy.table.initial_value
     untried = np.zeros(len(case.rows), bool)
     for rows in case.factors:
@@ -308,12 +317,20 @@ def _untried_actions(case: _Case) -> Iterator[Finding]:
     share = float(case.weights[untried].sum())
     if share > MOST_UNTRIED:
         yield Finding(
-            "untried_actions",
+            "optimism",
             "initial_value",
             share,
             f"for {share:.0%} of the visits the greedy action was never tried, as initial_value={initial:g} is above "
-            f"the values of the others: give a lower one (the median value is {np.median(case.values):.3g}), or train "
-            "longer",
+            "the values of the others. Give a lower one, or train longer",
+        )
+    most, mean = max(0.0, case.attainable[1]), float(case.weights @ case.values)
+    if initial > most and mean > most + MOST_OPTIMISM * (initial - most):
+        yield Finding(
+            "optimism",
+            "initial_value",
+            mean,
+            f"the values are {mean:.3g} on average, and the rewards allow at most {most:.3g}: what is left of "
+            f"initial_value={initial:g} decides what the model does. Give one nearer to {most:.3g}, or train longer",
         )
 
 
@@ -383,7 +400,7 @@ CHECKS = (
     _constant_dimension,
     _useless_dimension,
     _initial_values,
-    _untried_actions,
+    _optimism,
     _too_coarse,
     _too_fine,
     _saturated,

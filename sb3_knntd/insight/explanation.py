@@ -81,6 +81,11 @@ class Explanation:
         return float(sum(each.probability * each.visits for each in self.neighbors))
 
     @property
+    def action_text(self) -> str:
+        """The name of the action, or the value of each of its dimensions with its name."""
+        return action_text(self._model, self.action, self.names)
+
+    @property
     def is_outside(self) -> bool:
         """Whether the observation is outside of what was seen, or most of its weight on points never visited."""
         return bool(self.beyond_bounds or self.beyond_seen) or self.known < 0.5
@@ -88,9 +93,8 @@ class Explanation:
     def __str__(self) -> str:
         names = self.names.observations
         lines = [f"At {', '.join(f'{name} = {x:.4g}' for name, x in zip(names, self.observation, strict=True))}"]
-        action = action_text(self._model, self.action, self.names)
         margin = f", {self.margin:.4g} better than the second" if np.isfinite(self.margin) else ""
-        lines += [f"{action}, value {self.value:.4g}{margin}", *self._cautions(), ""]
+        lines += [f"{self.action_text}, value {self.value:.4g}{margin}", *self._cautions(), ""]
         return "\n".join(lines + _table(*self._rows()))
 
     def _cautions(self) -> list[str]:
@@ -113,13 +117,15 @@ class Explanation:
             row = [str(each.index), *place, f"{each.distance:.3f}", f"{each.probability:.3f}", f"{each.visits:,}"]
             rows.append([*row, *self._values(each.values, all_columns)])
         total = ["mean", *([""] * len(self.names.observations)), "", "1.000", f"{self.visits:,.0f}"]
-        return head, [*rows, [*total, *self._values(self.q_values, all_columns)]]
+        if all_columns:
+            return head, [*rows, [*total, *(f"{value:.4g}" for value in self.q_values)]]
+        return head, [*rows, [*total, self.action_text, f"{self.value:.4g}"]]
 
     def _values(self, values: np.ndarray, all_columns: bool) -> list[str]:
         if all_columns:
             return [f"{value:.4g}" for value in values]
-        best = int(values.argmax())
-        return [self.columns[best], f"{values[best]:.4g}"]
+        best = [first + int(values[first:end].argmax()) for first, end in self._model.policy.selector.factor_ranges]
+        return [", ".join(self.columns[column] for column in best), f"{values[best].mean():.4g}"]
 
     def plot(self, dims: tuple[int, int] | None = None, axes: Sequence[Axes] | None = None) -> tuple[Axes, ...]:
         """

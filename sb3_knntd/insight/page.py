@@ -20,7 +20,7 @@ from sb3_knntd.insight.labels import column_names
 from sb3_knntd.perception import Lattice, Scattered
 from sb3_knntd.perception.bounds import FARTHEST
 from sb3_knntd.perception.weights import KernelWeights
-from sb3_knntd.plots import Names, names_for, running_median
+from sb3_knntd.plots import Names, names_for, running_median, telling_dims
 from sb3_knntd.policies import KNNPolicy
 
 if TYPE_CHECKING:
@@ -132,6 +132,7 @@ def page_content(
         "columns": list(column_names(policy, names)),
         "low": bounds.low.tolist(),
         "high": bounds.high.tolist(),
+        "dims": _dims(model),
         "isWhole": not isinstance(model.observation_space, spaces.Box),
         "seen": [experience.low.tolist(), experience.high.tolist()] if experience.n_steps else None,
         "limit": FARTHEST,
@@ -144,13 +145,22 @@ def page_content(
     }
 
 
+def _dims(model: Inspectable) -> list[int]:
+    """The two dimensions that are shown first; the second is -1 if there is one only."""
+    if isinstance(model.observation_space, spaces.Box) and model.policy.perceiver.bounds.obs_dim > 1:
+        return list(telling_dims(model))
+    return [0, 1 if model.policy.perceiver.bounds.obs_dim > 1 else -1]
+
+
 def _facts(policy: KNNPolicy) -> str:
     points = policy.perceiver.points
-    if isinstance(points, Lattice):
-        form = f"{' × '.join(f'{n:,}' for n in points.shape)} lattice" if points.obs_dim > 1 else "one for each place"
+    if not isinstance(policy.observation_space, spaces.Box):
+        form = "one for each state"
+    elif isinstance(points, Lattice):
+        form = f"a lattice of {' × '.join(f'{n:,}' for n in points.shape)}"
     else:
         form = "scattered"
-    return f"{policy.n_neighbors} nearest of {points.n_points:,} points ({form})"
+    return f"{policy.n_neighbors} nearest of {points.n_points:,} points, {form}"
 
 
 def _weights(policy: KNNPolicy) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium import spaces
 
-from sb3_knntd.insight.labels import action_text
 from sb3_knntd.plots import BASELINE_COLOR, LINE_COLOR, count_panels, new_figure, plot_value_function, telling_dims
 from sb3_knntd.policies import TableModel
 
@@ -45,9 +44,10 @@ def plot_explanation(
         fixed = {dim: float(explanation.observation[dim]) for dim in others}
         for ax in plot_value_function(model, dims, fixed, axes=maps, names=explanation.names):
             _draw_neighbors(ax, explanation, dims)
-    _draw_values(bars, explanation)
-    action = action_text(model, explanation.action, explanation.names)
-    bars.set_title(f"{action}, value {explanation.value:.4g}", fontsize="medium")
+    # With continuous actions each neighbour chooses, and the mean values choose nothing.
+    chosen = int(explanation.q_values.argmax()) if isinstance(model.action_space, spaces.Discrete) else -1
+    _draw_values(bars, explanation, chosen)
+    bars.set_title(f"{explanation.action_text}, value {explanation.value:.4g}", fontsize="medium")
     return tuple(axes)
 
 
@@ -77,16 +77,15 @@ def _draw_neighbors(axes: Axes, explanation: Explanation, dims: tuple[int, int])
     axes.set(xlim=limits[0], ylim=limits[1])
 
 
-def _draw_values(axes: Axes, explanation: Explanation) -> None:
+def _draw_values(axes: Axes, explanation: Explanation, chosen: int) -> None:
     values = explanation.q_values
     places = np.arange(len(values))
     axes.hlines(places, min(values.min(), *(each.values.min() for each in explanation.neighbors)), values, color="0.85")
     for neighbor in explanation.neighbors:
         size = 24 * np.sqrt(neighbor.probability)
         axes.plot(neighbor.values, places, "o", color=LINE_COLOR, alpha=0.35, markersize=size, markeredgewidth=0)
-    best = int(values.argmax())
     for place, value in enumerate(values):
-        color = BASELINE_COLOR if place == best else "0.35"
+        color = BASELINE_COLOR if place == chosen else "0.35"
         axes.plot(value, place, "|", color=color, markersize=22, markeredgewidth=3)
     axes.set_yticks(places, explanation.columns)
     axes.set_ylim(len(values) - 0.5, -0.5)
