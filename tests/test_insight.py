@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from gymnasium import spaces
 from playwright.sync_api import Browser, Page, sync_playwright
 from stable_baselines3.common.monitor import Monitor
@@ -21,6 +22,7 @@ from sb3_knntd.cli import main
 from sb3_knntd.insight import Diagnosis, read_monitor, write_page
 from sb3_knntd.insight.diagnosis import LEAST_STEPS
 from sb3_knntd.plots import NAMES, Names
+from sb3_knntd.registry import ALGORITHMS, Role, with_role
 
 CHROMIUM = Path("/usr/bin/chromium")
 SCATTERED = np.random.default_rng(0).uniform([-1.2, -0.07], [0.6, 0.07], (150, 2))
@@ -289,11 +291,38 @@ ORDINARY: dict[str, tuple[type[KNNTD] | type[ExA], str]] = {
 }
 
 
-@pytest.mark.parametrize("steps", [6_000, 12_000])
 @pytest.mark.parametrize("case", ORDINARY)
-def test_an_ordinary_run_has_no_finding(case: str, steps: int) -> None:
+def test_an_ordinary_run_has_no_finding(case: str) -> None:
     cls, env = ORDINARY[case]
-    assert str(cls(env, seed=steps).learn(steps).diagnose()).endswith("Nothing was found.")
+    model = cls(env, seed=0)
+    model.learn(6_000)
+    assert str(model.diagnose()).endswith("Nothing was found.")
+    model.learn(6_000)
+    assert str(model.diagnose()).endswith("Nothing was found.")
+
+
+def tuned() -> list[tuple[str, str]]:
+    """Algorithm and environment of the tuned settings."""
+    found = []
+    for algorithm in with_role(Role.OWN).values():
+        assert algorithm.config_path is not None
+        settings = yaml.safe_load(algorithm.config_path.read_text(encoding="utf-8"))
+        found += [(algorithm.name, env) for env in settings if env != "default"]
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "env"), tuned())
+def test_a_tuned_run_has_no_finding(name: str, env: str, tmp_path: Path) -> None:
+    try:
+        gym.make(env).close()
+    except (gym.error.Error, ImportError) as error:
+        pytest.skip(str(error))
+    arguments = ["--algo", name, "--env", env, "--seed", "1", "-f", str(tmp_path), "--eval-freq", "-1"]
+    assert main(["train", *arguments]) == 0
+    (saved,) = tmp_path.rglob(f"{env.split('/')[-1]}.zip")
+    diagnosis = ALGORITHMS[name].load().load(saved).diagnose()
+    assert str(diagnosis).endswith("Nothing was found.")
 
 
 def test_too_few_steps_tell_nothing() -> None:
@@ -306,7 +335,7 @@ def test_learn_says_what_may_be_wrong(capsys: pytest.CaptureFixture[str]) -> Non
     bounds = ([-1.2, -0.005], [0.6, 0.005])
     KNNTD("MountainCar-v0", seed=0, bounds=bounds, verbose=1).learn(6_000, log_interval=None)
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("bounds: ")
+    assert last.startswith("Check bounds: ")
     assert "beyond [-0.005, 0.005] in velocity" in last
     KNNTD("MountainCar-v0", seed=0, bounds=bounds).learn(6_000)
     assert capsys.readouterr().out == ""
@@ -314,6 +343,21 @@ def test_learn_says_what_may_be_wrong(capsys: pytest.CaptureFixture[str]) -> Non
     capsys.readouterr()
     model.learn(6_000, log_interval=None)
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("env", "said"), [("Rewardless-v0", ["Check initial_value: "]), ("MountainCar-v0", [])])
+def test_the_demo_says_what_may_be_wrong(
+    env: str, said: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gym.register("Rewardless-v0", lambda: Rewards(0.0), max_episode_steps=200)
+    monkeypatch.setattr("sb3_knntd.experiments.demo.EVAL_EPISODES", 2)
+    monkeypatch.setattr("sb3_knntd.experiments.demo.EVAL_ENVS", 2)
+    try:
+        assert main(["demo", "--env", env, "--steps", "6000", "--out", str(tmp_path)]) == 0
+    finally:
+        del gym.registry["Rewardless-v0"]
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Check ")]
+    assert [line[: len(start)] for line, start in zip(lines, said, strict=True)] == said
 
 
 def test_a_diagnosis_changes_nothing() -> None:

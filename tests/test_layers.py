@@ -106,9 +106,11 @@ def test_the_layout_in_contributing_names_every_part() -> None:
     assert named == {*HEIGHT, "zoo_configs"}
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["compare", "--help"], ["reproduce", "--help"], ["demo", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], *([command, "--help"] for command in ("compare", "demo", "inspect", "reproduce"))]
+)
 def test_help_does_not_wait_for_what_only_the_commands_need(arguments: list[str]) -> None:
-    slow = ("rl_zoo3", "optuna", "matplotlib", "rliable", "pandas", "ray")
+    slow = ("rl_zoo3", "optuna", "matplotlib", "plotly", "rliable", "pandas", "ray")
     program = f"""
 import sys
 from sb3_knntd.cli import main

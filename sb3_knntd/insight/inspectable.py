@@ -51,4 +51,4 @@ class Inspectable(OnlineAlgorithm):
         super()._conclude()
         if self.verbose >= 1:
             for finding in self.diagnose():
-                print(finding)
+                print(f"Check {finding}")
