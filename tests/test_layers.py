@@ -106,9 +106,10 @@ def test_the_layout_in_contributing_names_every_part() -> None:
     assert named == {*HEIGHT, "zoo_configs"}
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--help"], *([command, "--help"] for command in ("compare", "demo", "inspect", "reproduce"))]
-)
+COMMANDS = "compare", "demo", "inspect", "reproduce"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], *([name, "--help"] for name in COMMANDS)])
 def test_help_does_not_wait_for_what_only_the_commands_need(arguments: list[str]) -> None:
     slow = ("rl_zoo3", "optuna", "matplotlib", "plotly", "rliable", "pandas", "ray")
     program = f"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sb3_knntd.insight.diagnosis import Diagnosis, Finding, diagnose
 from sb3_knntd.insight.explanation import Explanation, explain
 from sb3_knntd.insight.inspectable import Inspectable
+from sb3_knntd.insight.neighbor import Neighbor
 from sb3_knntd.insight.page import Episodes, read_monitor, write_page
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "Explanation",
     "Finding",
     "Inspectable",
+    "Neighbor",
     "diagnose",
     "explain",
     "read_monitor",

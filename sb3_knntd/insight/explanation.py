@@ -11,6 +11,8 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.insight.labels import action_text, column_names
+from sb3_knntd.insight.neighbor import Neighbor
+from sb3_knntd.insight.pictures import plot_explanation
 from sb3_knntd.perception import Bounds
 from sb3_knntd.plots import Names, names_for
 from sb3_knntd.policies import TableModel
@@ -20,27 +22,6 @@ if TYPE_CHECKING:
 
 #: With more columns, the text shows only the best one of each neighbour.
 MOST_COLUMNS_SHOWN = 8
-
-
-@dataclass(frozen=True)
-class Neighbor:
-    """
-    One of the k nearest points of an observation.
-
-    :param index: number of the point, its row in ``policy.points``
-    :param point: its place, shape (obs_dim,), observation units
-    :param distance: its distance from the observation, scaled units (the range of each dimension has width 2)
-    :param probability: its weight, normalised
-    :param values: its action values, shape (n_columns,)
-    :param visits: number of learning steps that have updated it
-    """
-
-    index: int
-    point: np.ndarray
-    distance: float
-    probability: float
-    values: np.ndarray
-    visits: int
 
 
 @dataclass(frozen=True)
@@ -139,9 +120,17 @@ class Explanation:
         :raises ValueError: if ``dims`` or ``axes`` do not fit
         :raises ImportError: if matplotlib is not installed
         """
-        from sb3_knntd.insight.pictures import plot_explanation
-
-        return plot_explanation(self, self._model, dims, axes)
+        return plot_explanation(
+            self._model,
+            self.observation,
+            self.neighbors,
+            self.q_values,
+            f"{self.action_text}, value {self.value:.4g}",
+            self.names,
+            self.columns,
+            dims,
+            axes,
+        )
 
 
 def explain(model: TableModel, observation: np.ndarray, names: Names | None = None) -> Explanation:

@@ -8,46 +8,65 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium import spaces
 
-from sb3_knntd.plots import BASELINE_COLOR, LINE_COLOR, count_panels, new_figure, plot_value_function, telling_dims
+from sb3_knntd.insight.neighbor import Neighbor
+from sb3_knntd.plots import (
+    BASELINE_COLOR,
+    LINE_COLOR,
+    Names,
+    count_panels,
+    new_figure,
+    plot_value_function,
+    telling_dims,
+)
 from sb3_knntd.policies import TableModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from sb3_knntd.insight.explanation import Explanation
-
 
 def plot_explanation(
-    explanation: Explanation, model: TableModel, dims: tuple[int, int] | None, axes: Sequence[Axes] | None
+    model: TableModel,
+    observation: np.ndarray,
+    neighbors: Sequence[Neighbor],
+    q_values: np.ndarray,
+    title: str,
+    names: Names,
+    columns: Sequence[str],
+    dims: tuple[int, int] | None = None,
+    axes: Sequence[Axes] | None = None,
 ) -> tuple[Axes, ...]:
     """
     Draw an explanation, see :meth:`~sb3_knntd.insight.Explanation.plot`.
 
-    :param explanation: the explanation
-    :param model: the model that it is of
+    :param model: the model
+    :param observation: shape (obs_dim,), observation units
+    :param neighbors: its nearest points
+    :param q_values: Q(s, ·), shape (n_columns,)
+    :param title: what the model does
+    :param names: names of the dimensions and actions
+    :param columns: names of the columns of the table
     :param dims: the two dimensions, horizontal and vertical; by default those along which the value changes most
     :param axes: axes to draw on; a new figure if not given
     :return: the axes
     :raises ValueError: if ``dims`` or ``axes`` do not fit
     :raises ImportError: if matplotlib is not installed
     """
-    has_map = isinstance(model.observation_space, spaces.Box) and len(explanation.observation) > 1
+    has_map = isinstance(model.observation_space, spaces.Box) and len(observation) > 1
     n_maps = count_panels(model) if has_map else 0
     if axes is None:
-        axes = _new_axes(n_maps, len(explanation.columns))
+        axes = _new_axes(n_maps, len(columns))
     elif len(axes) != n_maps + 1:
         raise ValueError(f"axes must be {n_maps + 1}, the last one for the values of the actions; got {len(axes)}")
     *maps, bars = axes
     if has_map:
         dims = telling_dims(model) if dims is None else dims
-        others = set(range(len(explanation.observation))) - set(dims)
-        fixed = {dim: float(explanation.observation[dim]) for dim in others}
-        for ax in plot_value_function(model, dims, fixed, axes=maps, names=explanation.names):
-            _draw_neighbors(ax, explanation, dims)
+        fixed = {dim: float(observation[dim]) for dim in set(range(len(observation))) - set(dims)}
+        for ax in plot_value_function(model, dims, fixed, axes=maps, names=names):
+            _draw_neighbors(ax, observation, neighbors, dims)
     # With continuous actions each neighbour chooses, and the mean values choose nothing.
-    chosen = int(explanation.q_values.argmax()) if isinstance(model.action_space, spaces.Discrete) else -1
-    _draw_values(bars, explanation, chosen)
-    bars.set_title(f"{explanation.action_text}, value {explanation.value:.4g}", fontsize="medium")
+    chosen = int(q_values.argmax()) if isinstance(model.action_space, spaces.Discrete) else -1
+    _draw_values(bars, q_values, neighbors, columns, chosen)
+    bars.set_title(title, fontsize="medium")
     return tuple(axes)
 
 
@@ -63,10 +82,10 @@ def _new_axes(n_maps: int, n_columns: int) -> Sequence[Axes]:
     return [*maps, figure.add_subplot(grid[n_maps])]
 
 
-def _draw_neighbors(axes: Axes, explanation: Explanation, dims: tuple[int, int]) -> None:
-    x, y = (explanation.observation[dim] for dim in dims)
+def _draw_neighbors(axes: Axes, observation: np.ndarray, neighbors: Sequence[Neighbor], dims: tuple[int, int]) -> None:
+    x, y = (observation[dim] for dim in dims)
     limits = axes.get_xlim(), axes.get_ylim()
-    for neighbor in explanation.neighbors:
+    for neighbor in neighbors:
         place = [neighbor.point[dim] for dim in dims]
         axes.plot([x, place[0]], [y, place[1]], color="white", linewidth=1, alpha=0.8)
         # The area is proportional to the weight.
@@ -77,17 +96,18 @@ def _draw_neighbors(axes: Axes, explanation: Explanation, dims: tuple[int, int])
     axes.set(xlim=limits[0], ylim=limits[1])
 
 
-def _draw_values(axes: Axes, explanation: Explanation, chosen: int) -> None:
-    values = explanation.q_values
+def _draw_values(
+    axes: Axes, values: np.ndarray, neighbors: Sequence[Neighbor], columns: Sequence[str], chosen: int
+) -> None:
     places = np.arange(len(values))
-    axes.hlines(places, min(values.min(), *(each.values.min() for each in explanation.neighbors)), values, color="0.85")
-    for neighbor in explanation.neighbors:
+    axes.hlines(places, min(values.min(), *(each.values.min() for each in neighbors)), values, color="0.85")
+    for neighbor in neighbors:
         size = 24 * np.sqrt(neighbor.probability)
         axes.plot(neighbor.values, places, "o", color=LINE_COLOR, alpha=0.35, markersize=size, markeredgewidth=0)
     for place, value in enumerate(values):
         color = BASELINE_COLOR if place == chosen else "0.35"
         axes.plot(value, place, "|", color=color, markersize=22, markeredgewidth=3)
-    axes.set_yticks(places, explanation.columns)
+    axes.set_yticks(places, list(columns))
     axes.set_ylim(len(values) - 0.5, -0.5)
     axes.set_xlabel("value (bar: mean, dots: neighbours)")
     axes.spines[["top", "right"]].set_visible(False)
