@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_knntd.perception import Lattice
 from sb3_knntd.plots import Names, names_for
-
-if TYPE_CHECKING:
-    from sb3_knntd.insight.inspectable import Inspectable
+from sb3_knntd.policies import TableModel
 
 #: After fewer steps nothing is said.
 LEAST_STEPS = 5_000
@@ -41,6 +39,14 @@ SATURATED, MOST_SATURATED = 0.95, 0.5
 LEAST_EFFECT, STEPS_FOR_EFFECT, PAIRS_FOR_EFFECT, SPAN_FOR_EFFECT = 0.12, 10_000, 100, 0.5
 #: Number of points that the effect of a dimension is computed from.
 SAMPLE = 1_000
+
+
+class TrainedModel(TableModel, Protocol):
+    """A model whose policy is a table that it has learned."""
+
+    gamma: Any
+    #: ε or the temperature at the last step
+    exploration_rate: float
 
 
 @dataclass(frozen=True)
@@ -109,7 +115,7 @@ class Diagnosis(Sequence[Finding]):
 class _Case:
     """What the checks look at."""
 
-    def __init__(self, model: Inspectable, names: Names) -> None:
+    def __init__(self, model: TrainedModel, names: Names) -> None:
         policy = model.policy
         self.model, self.policy, self.names = model, policy, names
         self.experience = policy.experience
@@ -173,7 +179,7 @@ class _Case:
         return f"{self.seen_low[dim]:.3g} to {self.seen_high[dim]:.3g}"
 
 
-def diagnose(model: Inspectable, names: Names | None = None) -> Diagnosis:
+def diagnose(model: TrainedModel, names: Names | None = None) -> Diagnosis:
     """
     Look for what hinders learning. The names of the findings, and what each says:
 

@@ -9,22 +9,19 @@ import json
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_knntd.common.files import replacing
-from sb3_knntd.insight.diagnosis import diagnose
+from sb3_knntd.insight.diagnosis import TrainedModel, diagnose
 from sb3_knntd.insight.labels import column_names
 from sb3_knntd.perception import Lattice, Scattered
 from sb3_knntd.perception.bounds import FARTHEST
 from sb3_knntd.perception.weights import KernelWeights
 from sb3_knntd.plots import Names, names_for, running_median, telling_dims
 from sb3_knntd.policies import KNNPolicy
-
-if TYPE_CHECKING:
-    from sb3_knntd.insight.inspectable import Inspectable
 
 #: Numbers in JavaScript hold no larger integers.
 LARGEST_INDEX = 2**53
@@ -68,7 +65,7 @@ def read_monitor(path: str | Path) -> Episodes:
 
 
 def write_page(
-    model: Inspectable,
+    model: TrainedModel,
     path: str | Path,
     episodes: Episodes | None = None,
     names: Names | None = None,
@@ -109,7 +106,7 @@ def write_page(
 
 
 def page_content(
-    model: Inspectable, episodes: Episodes | None = None, names: Names | None = None, env_id: str = ""
+    model: TrainedModel, episodes: Episodes | None = None, names: Names | None = None, env_id: str = ""
 ) -> dict[str, Any]:
     """
     :param model: the model
@@ -145,7 +142,7 @@ def page_content(
     }
 
 
-def _dims(model: Inspectable) -> list[int]:
+def _dims(model: TrainedModel) -> list[int]:
     """The two dimensions that are shown first; the second is -1 if there is one only."""
     if isinstance(model.observation_space, spaces.Box) and model.policy.perceiver.bounds.obs_dim > 1:
         return list(telling_dims(model))
@@ -206,7 +203,7 @@ def _table(policy: KNNPolicy) -> dict[str, Any]:
     }
 
 
-def _action_space(model: Inspectable) -> dict[str, Any]:
+def _action_space(model: TrainedModel) -> dict[str, Any]:
     space = model.action_space
     if not isinstance(space, spaces.Box):
         return {"actionPoints": None}
