@@ -39,7 +39,7 @@ def main() -> None:
         page_file = Path(folder) / "page.html"
         write_page(model, page_file, read_monitor(Path(folder) / "run.monitor.csv"), env_id="MountainCar-v0")
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page = browser.new_page(viewport={"width": 1400, "height": 900})
         page.goto(page_file.as_uri())
         page.wait_for_load_state("networkidle")
         page.screenshot(path=out / "inspect_page.png", full_page=True)
