@@ -33,6 +33,7 @@ from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.schedules import check_rate, constant_of, make_schedule
 from sb3_knntd.common.transitions import check_transition
+from sb3_knntd.insight import Inspectable
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.learners import CompiledLearner, Learner, Rates, TorchLearner
@@ -46,7 +47,7 @@ NONE_TRUNCATED: dict[int, np.ndarray] = {}
 LARGEST_SEED = 2**32 - 1
 
 
-class KNNAlgorithm(SavedAlgorithm):
+class KNNAlgorithm(Inspectable, SavedAlgorithm):
     """
     Base class of the algorithms of this package: parameters, policy, learner, and measuring of unbounded dimensions.
 
@@ -277,11 +278,20 @@ class KNNAlgorithm(SavedAlgorithm):
     def _make_learner(self) -> Learner:
         policy, config = self.policy, self._update_config()
         if policy.is_compiled:
-            return CompiledLearner(policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config)
+            return CompiledLearner(
+                policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config, policy.experience
+            )
         assert isinstance(policy.table, DenseTable)
         one_step = self.trace_decay == 0.0
         return TorchLearner(
-            policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config, one_step=one_step
+            policy.perceiver,
+            policy.table,
+            policy.selector,
+            self._stream,
+            self.n_envs,
+            config,
+            policy.experience,
+            one_step=one_step,
         )
 
     def _update_config(self) -> UpdateConfig:

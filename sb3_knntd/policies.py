@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import cloudpickle
 import numpy as np
@@ -13,6 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.actions.columns import ActionColumns, discrete_columns, make_action_columns
 from sb3_knntd.actions.exploration import EpsilonGreedy
@@ -29,6 +30,7 @@ from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.compiled import GreedyReader
 from sb3_knntd.learners.growth import grow, lay_anew
 from sb3_knntd.perception import (
+    Experience,
     GrowingPoints,
     Growth,
     Lattice,
@@ -118,6 +120,8 @@ class KNNPolicy(BasePolicy):
         }
         self.perceiver = make_perceiver(perception, observation_space, bounds_from_space=bounds_from_space)
         self.n_neighbors = self.perceiver.search.n_neighbors
+        #: statistics of the steps that were learned from
+        self.experience = Experience(self.perceiver.bounds.obs_dim)
         self._compilable = compiled and jit.AVAILABLE and isinstance(self.perceiver.weights, KernelWeights)
         if compiled and not jit.AVAILABLE:
             warnings.warn(
@@ -218,6 +222,14 @@ class KNNPolicy(BasePolicy):
         ``set_parameters``.
         """
         return self.table.entries()
+
+    @property
+    def visits(self) -> th.Tensor:
+        """
+        The number of learning steps that have updated each of :attr:`points` as one of the k nearest, up to 2³⁰, shape
+        (n_points,), int32. Updates along the traces are not counted.
+        """
+        return self.table.counts()
 
     def widen(self, observations: th.Tensor) -> None:
         """
@@ -485,6 +497,17 @@ class KNNPolicy(BasePolicy):
             "action_space": self.action_space,
             **self._arguments,
         }
+
+
+class TableModel(Protocol):
+    """A model whose policy is a table: what pictures and explanations are made from."""
+
+    policy: KNNPolicy
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+
+    def get_env(self) -> VecEnv | None:
+        """The environment; ``None`` if there is none."""
 
 
 class ExAPolicy(KNNPolicy):

@@ -6,6 +6,7 @@ from functools import cache, partial
 
 import numpy as np
 
+from sb3_knntd.kernels.experience import record_steps
 from sb3_knntd.kernels.jit import inlined, jit
 from sb3_knntd.kernels.perceive import SearchKind, perceive
 from sb3_knntd.kernels.selection import (
@@ -24,6 +25,7 @@ from sb3_knntd.kernels.traces import (
     LEAST_CLOCK,
     activate,
     active_value,
+    count_visit,
     end_episode,
     find,
     flush,
@@ -93,6 +95,7 @@ def begin(state, observations, uniforms, rate):
     state.lengths[1:] = 0.0
     for env in range(len(observations)):
         state.persistent[env, :] = UNDRAWN
+        state.current_observations[env] = observations[env]
         perceive_into(state, observations[env], CURRENT, env)
         select_at(state, uniforms[env], rate, CURRENT, env)
 
@@ -172,6 +175,7 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
                 place = find(indices[env, i], slots)
                 if place < 0:
                     place = activate(indices[env, i], state, state)
+            count_visit(indices[env, i], state.visits, row_slots)
             for factor in range(n_factors):
                 entry = chosen[env, i, factor]
                 if state.accumulating:
@@ -287,6 +291,7 @@ def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate)
         target_values[env] = value
     outcome = update_table(state, target_values, rewards, ended, learning_rate, trace_decay)
     if outcome == OK:
+        record_steps(state, observations, rewards, ended)
         _advance(state)
     return outcome
 

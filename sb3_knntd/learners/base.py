@@ -16,7 +16,7 @@ from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE, LEAST_CLOCK
 from sb3_knntd.learners.growth import grow, lay_anew
-from sb3_knntd.perception import GrowingPoints, Perceiver
+from sb3_knntd.perception import Experience, GrowingPoints, Perceiver
 from sb3_knntd.q_table import QTable
 from sb3_knntd.q_table.active_traces import SMALLEST_CAPACITY
 
@@ -111,19 +111,27 @@ class Learner(ABC):
     :param selector: selects actions
     :param n_envs: number of environments
     :param config: variant of the update
+    :param experience: where each step is recorded
     """
 
     #: whether the state of the episodes is known; if not, call :meth:`begin`
     in_episodes = False
 
     def __init__(
-        self, perceiver: Perceiver, table: QTable, selector: ActionSelector, n_envs: int, config: UpdateConfig
+        self,
+        perceiver: Perceiver,
+        table: QTable,
+        selector: ActionSelector,
+        n_envs: int,
+        config: UpdateConfig,
+        experience: Experience,
     ) -> None:
         self.perceiver = perceiver
         self.table = table
         self.selector = selector
         self.n_envs = n_envs
         self.config = config
+        self.experience = experience
         #: number of environments, neighbours, and action factors
         self.shape = n_envs, perceiver.search.n_neighbors, selector.n_factors
 
@@ -203,6 +211,13 @@ class Learner(ABC):
             grow(self.perceiver, self.table, seen)
         grow(self.perceiver, self.table, seen)
 
+    def _record(self, transitions: Transitions, n: int) -> None:
+        """Record the first ``n`` transitions."""
+        rows = [th.as_tensor(np.asarray(array)[:n]) for array in transitions]
+        before, after = (array.reshape(n, self.perceiver.bounds.obs_dim) for array in (rows[0], rows[3]))
+        # Both observations of a given transition belong to it, also at the end of an episode.
+        self.experience.record(before, after, rows[2].reshape(n), th.zeros(n, dtype=th.bool), self.perceiver.bounds)
+
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
         """
         Change parameters within the current episodes.
@@ -256,6 +271,12 @@ class Learner(ABC):
         if in_episodes:
             self._take_over(state_dict)
 
+    def _observations_in(self, state_dict: dict[str, Any]) -> th.Tensor:
+        """The current observations, shape (n_envs, obs_dim); infinite in a state that was saved without them."""
+        unknown = th.full((self.n_envs, self.perceiver.bounds.obs_dim), th.inf, dtype=th.float64)
+        observations: th.Tensor = state_dict.get("observations", unknown)
+        return observations
+
     @abstractmethod
     def _forget(self) -> None:
         """Drop all traces and the values of the entries with a trace."""
@@ -275,6 +296,9 @@ class Learner(ABC):
         checked_tensor(state, "entries", (n_envs, k, n_factors), th.int64, 0, n_actions - 1)
         checked_tensor(state, "held", (n_envs, n_factors), th.int64, UNDRAWN, n_actions - 1)
         checked_tensor(state, "lengths", (1 + n_envs,), th.float64, 0.0)
+        if "observations" in state:
+            shape = n_envs, self.perceiver.bounds.obs_dim
+            checked_tensor(state, "observations", shape, th.float64, finite=False)
         traces, rows = entry(state, "traces"), self.table.points()
         active = checked_points(traces, "points", n_points)
         if rows is not None and not th.isin(active, rows).all():

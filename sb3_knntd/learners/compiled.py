@@ -19,7 +19,7 @@ from sb3_knntd.kernels.state import EpisodeArrays, RandomRows, UpdateConfig, Wor
 from sb3_knntd.kernels.traces import adopt, write_back
 from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, check_rates, update_rates
 from sb3_knntd.learners.growth import FLOAT32, as_rows
-from sb3_knntd.perception import Perceiver
+from sb3_knntd.perception import Experience, Perceiver
 from sb3_knntd.q_table import ActiveTraces, QTable
 
 
@@ -34,6 +34,7 @@ class Workplace:
     :param config: variant of the update
     :param traces: the eligibility traces; ``None`` for those of the table
     :param stream: rows of random numbers, shape (n_envs, 2, n_uniforms); ``None`` if none are needed
+    :param experience: where each step is recorded; ``None`` if none are made
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Workplace:
         config: UpdateConfig,
         traces: ActiveTraces | None = None,
         stream: RandomStream | None = None,
+        experience: Experience | None = None,
     ) -> None:
         self.perceiver = perceiver
         self.table = table
@@ -52,6 +54,7 @@ class Workplace:
         self.config = config
         self.traces = traces
         self.stream = stream
+        self.experience = experience or Experience(perceiver.bounds.obs_dim)
         k, n_factors, n_actions = perceiver.search.n_neighbors, len(selection.factors) - 1, table.n_actions
         self.episodes = EpisodeArrays(
             indices=np.zeros((3, n_envs, k), np.int64),
@@ -60,6 +63,7 @@ class Workplace:
             actions=np.zeros((3, n_envs, selection.action_points.shape[1])),
             truncated=np.zeros(n_envs, np.bool_),
             last_observations=np.zeros((n_envs, perceiver.bounds.obs_dim)),
+            current_observations=np.full((n_envs, perceiver.bounds.obs_dim), np.inf),
             persistent=np.full((n_envs, n_factors), UNDRAWN),
             lengths=np.zeros(1 + n_envs),
         )
@@ -94,6 +98,7 @@ class Workplace:
             self.episodes,
             random,
             self.work,
+            self.experience.arrays(),
         )
         # numba does not support an interruption while it boxes or unboxes a state.
         with interrupts_held():
@@ -129,6 +134,7 @@ class CompiledLearner(Learner):
     :param stream: rows of random numbers, shape (n_envs, 2, selector.n_uniforms)
     :param n_envs: number of environments
     :param config: variant of the update
+    :param experience: where each step is recorded
     """
 
     def __init__(
@@ -139,11 +145,14 @@ class CompiledLearner(Learner):
         stream: RandomStream,
         n_envs: int,
         config: UpdateConfig,
+        experience: Experience,
     ) -> None:
-        super().__init__(perceiver, table, selector, n_envs, config)
+        super().__init__(perceiver, table, selector, n_envs, config, experience)
         self.stream = stream
         table.start_traces(n_envs)
-        self._workplace = Workplace(perceiver, table, selector.kernel_arguments(), n_envs, config, stream=stream)
+        self._workplace = Workplace(
+            perceiver, table, selector.kernel_arguments(), n_envs, config, stream=stream, experience=experience
+        )
         self._prepare()
 
     def _prepare(self) -> None:
@@ -287,6 +296,7 @@ class CompiledLearner(Learner):
                     elif outcome != td.OK:
                         raise FloatingPointError(f"transition {done}: {DIVERGENCE}")
             finally:
+                self._record(transitions, done)
                 write_back(self.table.arrays(), own.arrays)
                 adopt(self.table.arrays(), self.table.traces.arrays)
                 self._workplace.work.value_bound[0] = np.inf
@@ -329,6 +339,7 @@ class CompiledLearner(Learner):
                 "entries": th.from_numpy(episodes.action_indices[td.CURRENT].copy()),
                 "held": th.from_numpy(episodes.persistent.copy()),
                 "lengths": th.from_numpy(episodes.lengths.copy()),
+                "observations": th.from_numpy(episodes.current_observations.copy()),
                 "traces": self.table.traces.state(),
             }
 
@@ -343,6 +354,7 @@ class CompiledLearner(Learner):
         episodes.action_indices[td.CURRENT] = state_dict["entries"].numpy()
         episodes.persistent[:] = state_dict["held"].numpy()
         episodes.lengths[:] = state_dict["lengths"].numpy()
+        episodes.current_observations[:] = self._observations_in(state_dict).numpy()
         # Sum in the order of the kernel, for the same rounding.
         actions = episodes.actions[td.CURRENT]
         actions[:] = 0.0

@@ -16,7 +16,7 @@ from sb3_knntd.kernels.selection import UNDRAWN, count_steps
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, check_rates, update_rates
-from sb3_knntd.perception import Perceiver, Perception
+from sb3_knntd.perception import Experience, Perceiver, Perception
 from sb3_knntd.q_table import DenseTable, DenseTraces, OneStepTraces, Traces
 
 
@@ -30,6 +30,7 @@ class TorchLearner(Learner):
     :param stream: rows of random numbers, shape (n_envs, 2, selector.n_uniforms)
     :param n_envs: number of environments
     :param config: variant of the update
+    :param experience: where each step is recorded
     :param one_step: whether λ is always 0, so that no traces are stored
     """
 
@@ -43,9 +44,10 @@ class TorchLearner(Learner):
         stream: RandomStream,
         n_envs: int,
         config: UpdateConfig,
+        experience: Experience,
         one_step: bool = False,
     ) -> None:
-        super().__init__(perceiver, table, selector, n_envs, config)
+        super().__init__(perceiver, table, selector, n_envs, config, experience)
         self.stream = stream
         self.one_step = one_step
         self.traces = self._make_traces(n_envs)
@@ -57,6 +59,7 @@ class TorchLearner(Learner):
         self.persistent = th.full((n_envs, n_factors), UNDRAWN, dtype=th.int64, device=values.device)
         #: see :func:`~sb3_knntd.kernels.selection.count_steps`; on the CPU, like ``ended``
         self.lengths = np.zeros(1 + n_envs)
+        self._observations = th.full((n_envs, perceiver.bounds.obs_dim), th.inf, dtype=th.float64)
         self._actions = np.empty(0)
         self._sums = values.new_zeros(2)
         self._n_sums = 0
@@ -86,6 +89,7 @@ class TorchLearner(Learner):
         self.lengths[1:] = 0.0
         self._persist(UNDRAWN, uniforms, exploration_rate)
         perception, selection = self._select(observations, uniforms, exploration_rate, self.persistent)
+        self._observations = self._tensor(observations).reshape(self.n_envs, -1)
         self._advance(perception, selection)
 
     def step(
@@ -129,6 +133,8 @@ class TorchLearner(Learner):
         self.table.visit(self.indices)
         self._sums += th.stack((errors.abs().sum(), value.sum()))
         self._n_sums += self.n_envs
+        before, self._observations = self._observations, self._tensor(observations).reshape(self.n_envs, -1)
+        self.experience.record(before, self._observations, self._tensor(rewards), over, self.perceiver.bounds)
         self._advance(perception, selection)
 
     def _update(
@@ -173,6 +179,7 @@ class TorchLearner(Learner):
             goes_on = False
             for t in range(len(columns)):
                 goes_on = self._update_from(traces, transitions, th.from_numpy(columns[t]), t, goes_on, rates)
+            self._record(transitions, len(columns))
 
     def _update_from(
         self, traces: Traces, transitions: Transitions, column: th.Tensor, t: int, goes_on: bool, rates: Rates
@@ -228,6 +235,7 @@ class TorchLearner(Learner):
             "entries": self.action_indices.cpu(),
             "held": self.persistent.cpu(),
             "lengths": th.from_numpy(self.lengths.copy()),
+            "observations": self._observations.double().cpu(),
             "traces": self.traces.state(),
         }
 
@@ -241,6 +249,7 @@ class TorchLearner(Learner):
         self.action_indices.copy_(state_dict["entries"])
         self.persistent.copy_(state_dict["held"])
         self.lengths[:] = state_dict["lengths"].numpy()
+        self._observations = self._observations_in(state_dict).to(self.indices.device)
         self.traces.set_state(state_dict["traces"])
         actions = self.selector.actions_of(self.action_indices, self.probabilities)
         self._actions = actions.cpu().numpy()

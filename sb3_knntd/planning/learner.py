@@ -43,7 +43,7 @@ class DynaLearner(Learner):
     def __init__(
         self, policy: KNNPolicy, planner: Planner, stream: RandomStream, n_envs: int, config: UpdateConfig
     ) -> None:
-        super().__init__(policy.perceiver, policy.table, policy.selector, n_envs, config)
+        super().__init__(policy.perceiver, policy.table, policy.selector, n_envs, config, policy.experience)
         self.policy, self.planner, self._stream = policy, planner, stream
         obs_dim = policy.perceiver.bounds.obs_dim
         self._is_box = policy.columns.points.shape[1] > 0
@@ -128,6 +128,8 @@ class DynaLearner(Learner):
                 # Where it ended is not known: that it ended is.
                 next_rows[env] = self._observations[env]
             self.planner.add(self._observations[env], actions[env], float(rewards[env]), next_rows[env], terminated)
+        before, after, seen_rewards, any_end = map(th.as_tensor, (self._observations, next_rows, rewards, ended))
+        self.experience.record(before, after, seen_rewards, any_end, self.perceiver.bounds)
         self._observations[:] = rows
         self._rest -= 1
         for env in np.flatnonzero(ended).tolist():
@@ -188,6 +190,7 @@ class DynaLearner(Learner):
         actions = self.scaled_actions(
             np.asarray(transitions.actions).reshape(n, -1) if self._is_box else transitions.actions
         )
+        self._record(transitions, n)
         is_first = True
         for i in range(n):
             if is_first:

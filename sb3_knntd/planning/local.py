@@ -139,6 +139,7 @@ class LocalPlanner(Planner):
         self.model.scale(transition)
         self._compare(transition)
         self.model.enter(transition)
+        self._visit(self.model.data.states[transition])
         self._cover(next_observation[None], may_add=not terminated)
 
     def _in_units(self, action: np.ndarray) -> np.ndarray:
@@ -147,8 +148,15 @@ class LocalPlanner(Planner):
             in_units: np.ndarray = self._actions[int(action[0])]
             return in_units
         low, high = self._actions.min(axis=0), self._actions.max(axis=0)
-        in_units = low + 0.5 * (action + 1.0) * (high - low)
-        return in_units
+        scaled: np.ndarray = low + 0.5 * (action + 1.0) * (high - low)
+        return scaled
+
+    def _visit(self, state: np.ndarray) -> None:
+        """Count a step at the nearest point."""
+        table = self.policy.table
+        assert isinstance(table, DenseTable)
+        point, _ = nearest_point(state, self.model.arrays.points, self.model.n_points)
+        table.visit(th.tensor([point], device=table.values.device))
 
     def _compare(self, transition: int) -> None:
         """Record how far a new transition is from what the model expects."""
@@ -219,7 +227,6 @@ class LocalPlanner(Planner):
         assert isinstance(table, DenseTable)
         with table.lock:
             table.values[:n] = th.from_numpy(self.values.simulated[:n]).to(table.values)
-            table.visit(th.from_numpy(np.flatnonzero(self.known.any(axis=1))).to(table.values.device))
 
     # ---------------------------------------------------------------- planning
 

@@ -64,7 +64,10 @@ class StatePlanner(Planner):
         self, observation: np.ndarray, action: np.ndarray, reward: float, next_observation: np.ndarray, terminated: bool
     ) -> None:
         self.rewards.add(reward, terminated)
+        table = self.policy.table
+        assert isinstance(table, DenseTable)
         at = self._state(observation), self._column(action)
+        table.visit(th.tensor([at[0]], device=table.values.device))
         self._tried[at] += 1.0
         self._reward_sums[at] += reward
         if terminated:
@@ -129,7 +132,6 @@ class StatePlanner(Planner):
         assert isinstance(table, DenseTable)
         with table.lock:
             table.values[:] = th.from_numpy(published).to(table.values)
-            table.visit(th.from_numpy(np.flatnonzero(known.any(axis=1))).to(table.values.device))
 
     def predict(self, observation: np.ndarray, action: np.ndarray) -> Prediction:
         at = self._state(observation), self._column(action)
