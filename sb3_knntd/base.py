@@ -36,17 +36,17 @@ from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.learners import CompiledLearner, Learner, Rates, TorchLearner
+from sb3_knntd.offline import OfflineLearning
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.q_table import DenseTable
-from sb3_knntd.saving import SavedAlgorithm
 
 NONE_TRUNCATED: dict[int, np.ndarray] = {}
 #: The largest seed of NumPy's global generator.
 LARGEST_SEED = 2**32 - 1
 
 
-class KNNAlgorithm(SavedAlgorithm):
+class KNNAlgorithm(OfflineLearning):
     """
     Base class of the algorithms of this package: parameters, policy, learner, and measuring of unbounded dimensions.
 
@@ -76,6 +76,7 @@ class KNNAlgorithm(SavedAlgorithm):
     initial_value: Any = FixedHyperparameter()
 
     _is_set_up = False
+    _rules_version = 0
     #: a schedule, and its value if that is constant
     _constant_trace: tuple[Any, float | None] = (None, None)
     #: Type of the supported action spaces, and advice for unsupported ones.
@@ -405,6 +406,10 @@ class KNNAlgorithm(SavedAlgorithm):
         if self._measuring:
             return self.policy.fit_actions(self._random_actions())
         learner = self.learner
+        if learner.selector.rules.version != self._rules_version:
+            # The next action may be forbidden now.
+            self._abandon_episodes()
+            self._rules_version = learner.selector.rules.version
         if not learner.in_episodes:
             assert isinstance(self._last_obs, np.ndarray)
             learner.begin(self._last_obs, self._rates()[2])
@@ -454,8 +459,8 @@ class KNNAlgorithm(SavedAlgorithm):
         return self._n_measured < steps_to_measure(self.n_envs) and self.policy.perceiver.bounds.is_open
 
     def _random_actions(self) -> np.ndarray:
-        uniforms = self._stream.next()[:, 0]
-        return (uniforms[:, 0] * self.policy.table.n_actions).astype(np.int64)
+        uniforms = self._stream.next()[:, 0, :1]
+        return self.policy.selector.random_columns(uniforms, self._last_obs)[:, 0]  # type: ignore[arg-type]
 
     def _measure(self, observations: np.ndarray, rewards: np.ndarray, truncated: dict[int, np.ndarray]) -> None:
         check_transition(observations, rewards)

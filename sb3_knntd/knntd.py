@@ -163,7 +163,9 @@ class KNNTD(KNNAlgorithm):
         target = check_member("target", self.target, Target)
         check_word("exploration", self.exploration, EXPLORATIONS)
         exploration = EXPLORATIONS[self.exploration]()
-        return MeanValueSelector(self.policy.columns, target, exploration, self.tie_break == "random")
+        return MeanValueSelector(
+            self.policy.columns, target, exploration, self.tie_break == "random", self.policy.rules
+        )
 
     def _make_exploration_schedule(self) -> Schedule:
         check_word("exploration", self.exploration, EXPLORATIONS)

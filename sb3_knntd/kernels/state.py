@@ -49,6 +49,7 @@ class EpisodeArrays(NamedTuple):
     :param last_observations: the last observation before the truncation, shape (n_envs, obs_dim)
     :param persistent: columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (n_envs, n_factors), int64
     :param lengths: see :func:`~sb3_knntd.kernels.selection.count_steps`
+    :param forbidden: the columns that the rules forbid, shape (3, n_envs, n_actions), bool, with the states as above
     """
 
     indices: np.ndarray
@@ -59,6 +60,7 @@ class EpisodeArrays(NamedTuple):
     last_observations: np.ndarray
     persistent: np.ndarray
     lengths: np.ndarray
+    forbidden: np.ndarray
 
 
 class RandomRows(NamedTuple):

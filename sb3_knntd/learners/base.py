@@ -226,6 +226,8 @@ class Learner(ABC):
         """
         in_episodes = getattr(entry(state_dict, "entries"), "shape", None) == self.shape
         if in_episodes:
+            # Files of versions without rules do not have it.
+            state_dict = {"forbidden": th.zeros(self.n_envs, self.table.n_actions, dtype=th.bool), **state_dict}
             self._check_state(state_dict)
             # All zeros if it was saved outside of episodes.
             in_episodes = bool(state_dict["probabilities"].any())
@@ -252,6 +254,7 @@ class Learner(ABC):
         checked_tensor(state, "entries", (n_envs, k, n_factors), th.int64, 0, n_actions - 1)
         checked_tensor(state, "held", (n_envs, n_factors), th.int64, UNDRAWN, n_actions - 1)
         checked_tensor(state, "lengths", (1 + n_envs,), th.float64, 0.0)
+        checked_tensor(state, "forbidden", (n_envs, n_actions), th.bool)
         traces, rows = entry(state, "traces"), self.table.points()
         active = checked_points(traces, "points", n_points)
         if rows is not None and not th.isin(active, rows).all():

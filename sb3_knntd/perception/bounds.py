@@ -128,6 +128,19 @@ class Bounds(nn.Module):
             th.where(highest > self.high, highest + margin, self.high),
         )
 
+    def take_over(self, before: Bounds) -> None:
+        """
+        Take the range of the open dimensions from other bounds.
+
+        :param before: bounds of the same dimensions
+        """
+        self.seen_low.copy_(before.seen_low)
+        self.seen_high.copy_(before.seen_high)
+        ends_stay = not self.adaptive
+        low = th.where(self.lowest.isfinite() & ends_stay, self.lowest, before.low)
+        high = th.where(self.highest.isfinite() & ends_stay, self.highest, before.high)
+        self._set(th.where(self.open, low, self.low), th.where(self.open, high, self.high))
+
     def reach(self) -> tuple[th.Tensor, th.Tensor]:
         """
         :return: the values (low, high) beyond which :meth:`widen` moves a bound, each of shape (obs_dim,), observation

@@ -160,6 +160,22 @@ class QTable(nn.Module, ABC):
         """
 
     @abstractmethod
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        """
+        :param points: points, shape (n,), int64
+        :return: whether each has been updated by learning, shape (n,), bool
+        """
+
+    @abstractmethod
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        """
+        Set the rows of some points. All traces are dropped.
+
+        :param points: different points, shape (n,), int64
+        :param values: their values, shape (n, n_actions)
+        """
+
+    @abstractmethod
     def arrays(self) -> TableArrays:
         """
         :return: the arrays for the kernels, which share memory with this table
@@ -252,6 +268,14 @@ class DenseTable(QTable):
             visited[: len(self.visited) - 1] = self.visited[:-1]
             self.values, self.visited = grown, visited
             self.version += 1
+
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        return self._visits()[points]
+
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        with self.lock:
+            self.drop_traces()
+            self.values[points] = values.to(self.values)
 
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
@@ -392,6 +416,16 @@ class HashedTable(QTable):
 
     def add_rows(self, values: th.Tensor) -> None:
         raise ValueError("points can be added to a dense table only: policy_kwargs={'table': 'dense'}")
+
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        return th.isin(points, self.points())
+
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        with self.lock:
+            self._write_back()
+            others = ~th.isin(self.points(), points)
+            kept = self.values[: self.n_visited][others]
+            self._refill(th.cat((self.points()[others], points)), th.cat((kept, values.to(kept))))
 
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
