@@ -25,7 +25,7 @@ from sb3_knntd.q_table.table import BATCH
 #: Number of places around a point at which a controller is asked.
 SAMPLES = 32
 #: ``margin=None``: share of the range of the table's values.
-MARGIN_SHARE = 0.1
+MARGIN_SHARE = 0.3
 
 
 class TableEditing:
@@ -103,14 +103,14 @@ class TableEditing:
         Make the actions of a controller the greedy ones, and keep the values of the states.
 
         The controller is asked at each point and at places around it. The action that it takes most often there gets
-        the largest value of the point's row, the others at most that less their share of the margin: the full margin if
-        the controller never takes them near the point, and nothing if it takes them as often. So learning, whose values
-        are noisy, does not lose the controller at once. The values of the states should be known, by learning from data
-        of the controller; ``model.imitate`` does both.
+        the largest value of the point's row, the others that less their share of the margin: the full margin if the
+        controller never takes them near the point, and nothing if it takes them as often. So learning, whose values are
+        noisy, does not lose the controller at once. The values of the states should be known, by learning from data of
+        the controller; ``model.imitate`` does both.
 
         :param controller: a function from an observation to an action, an SB3 model or policy, or another object whose
             ``predict`` returns (action, state). Its actions must depend on the observation alone
-        :param margin: in units of return, > 0; by default a tenth of the range of the table's values, or 1 if all are
+        :param margin: in units of return, > 0; by default 0.3 of the range of the table's values, or 1 if all are
             equal
         :raises ValueError: if an argument is invalid, the controller returns no action of the action space, or the
             range of the observations is not known yet; nothing has been changed
@@ -131,10 +131,8 @@ class TableEditing:
                 shares[rows, columns] += 1.0 / SAMPLES
             values = self.table.rows(self._at(points)[None])[0].double().cpu().numpy()
             for first, end in pairwise(factors):
-                part, share = values[:, first:end], shares[:, first:end]
-                best = part.max(axis=1, keepdims=True)
-                lacks = share.max(axis=1, keepdims=True) - share
-                values[:, first:end] = np.where(lacks > 0.0, np.minimum(part, best - margin * lacks), best)
+                lacks = shares[:, first:end].max(axis=1, keepdims=True) - shares[:, first:end]
+                values[:, first:end] = values[:, first:end].max(axis=1, keepdims=True) - margin * lacks
             batches.append((points, values))
         self._write(batches)
 
