@@ -29,8 +29,8 @@ INERTIA = 0.005  # kg m²
 
 class MotorEnv(gym.Env):
     """
-    Observation: the angle from the set angle, rad, and the speed, rad/s. Action: one of five voltages. Reward: minus the
-    square of the angle, and a little of that of the voltage.
+    Observation: the angle from the set angle, rad, and the speed, rad/s. Action: one of five voltages. Reward: minus
+    the square of the angle, and a little of that of the voltage.
     """
 
     def __init__(self):
@@ -83,21 +83,22 @@ def respond(act):
 def main():
     path = Path(sys.argv[1] if len(sys.argv) > 1 else "dc_motor.png")
     model = KNNTD(gym.make("DCMotor-v0"), seed=0)
+    responses = {"controller": respond(proportional)}
+
+    def greedy(observation):
+        return int(model.predict(observation, deterministic=True)[0])
+
     model.imitate(proportional)
     learners = {"controller": proportional}
-    started = KNNTD.load(_saved(model))
+    responses["table that imitates it"] = respond(greedy)
     model.learn(50_000)
-    learners |= {
-        "table that imitates it": lambda observation: int(started.predict(observation, deterministic=True)[0]),
-        "after learning": lambda observation: int(model.predict(observation, deterministic=True)[0]),
-    }
+    responses["after learning"] = respond(greedy)
 
     figure = new_figure(7.0, 3.6)
     axes = figure.subplots()
     seconds = SECONDS_PER_STEP * np.arange(STEPS)
     styles = [(BASELINE_COLOR, "-"), (BASELINE_COLOR, ":"), (LINE_COLOR, "-")]
-    for (name, act), (color, line) in zip(learners.items(), styles, strict=True):
-        angles = respond(act)
+    for (name, angles), (color, line) in zip(responses.items(), styles, strict=True):
         print(f"{name}: mean squared angle {np.mean(angles**2):.3f} rad²")
         axes.plot(seconds, angles, line, color=color, linewidth=1.8, label=name)
     axes.axhline(0.0, color="0.3", linestyle="--", linewidth=1)
@@ -105,15 +106,6 @@ def main():
     axes.legend(frameon=False)
     figure.savefig(path)
     print(path)
-
-
-def _saved(model):
-    from io import BytesIO
-
-    file = BytesIO()
-    model.save(file)
-    file.seek(0)
-    return file
 
 
 if __name__ == "__main__":

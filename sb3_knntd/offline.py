@@ -130,14 +130,19 @@ class OfflineLearning(SavedAlgorithm):
         :raises ValueError: if an argument is invalid; the model is as it was
         """
         before = dict(vars(self))
-        changes = {name: value for name, value in (("points", points), ("bounds", bounds)) if value is not None}
+        given = {"points": points, "bounds": bounds}
+        changes = {
+            name: value for name, value in given.items() if value is not None and not _same(value, getattr(self, name))
+        }
+        if not changes:
+            return self
         streams = self._stream.state(), self._prediction_stream.state()
         self._is_set_up = False
         try:
             for name, value in changes.items():
                 setattr(self, name, value)
             self._setup_model()
-            self.policy.take_over(before["policy"], measured=bounds is None)
+            self.policy.take_over(before["policy"], measured="bounds" not in changes)
             if not self._must_measure():
                 # It is known, also where the new bounds leave it open.
                 self._n_measured = steps_to_measure(self.n_envs)
@@ -180,6 +185,14 @@ class OfflineLearning(SavedAlgorithm):
             next_observations=np.asarray(normalizer.normalize_obs(transitions.next_observations)),
             rewards=normalizer.normalize_reward(transitions.rewards),
         )
+
+
+def _same(value: Any, other: Any) -> bool:
+    """Whether two arguments are equal, as numbers, words or arrays; a file holds lists for tuples."""
+    try:
+        return bool(np.array_equal(np.asarray(value), np.asarray(other)))
+    except ValueError:  # rows of different lengths
+        return False
 
 
 def _lowest_return(transitions: Transitions, gamma: float) -> float:

@@ -34,7 +34,7 @@ class Rules(nn.Module):
         self.register_buffer("columns", th.empty((0, n_columns), dtype=th.bool))
 
     def __len__(self) -> int:
-        return len(self.low)
+        return int(self.low.shape[0])
 
     def extra_repr(self) -> str:
         return "\n".join(
@@ -78,9 +78,9 @@ class Rules(nn.Module):
         :param observations: shape (batch, *obs_shape), any number type, observation units
         :return: the columns that are forbidden there, shape (batch, n_columns), bool
         """
-        seen = observations.reshape(len(observations), 1, -1).to(self.low)
         if not len(self):
-            return th.zeros((len(seen), self.columns.shape[1]), dtype=th.bool, device=seen.device)
+            return th.zeros((len(observations), self.columns.shape[1]), dtype=th.bool, device=self.low.device)
+        seen = observations.reshape(-1, 1, self.low.shape[1]).to(self.low)
         inside = ((self.low <= seen) & (seen <= self.high)).all(dim=2)
         return (inside[..., None] & self.columns).any(dim=1)
 
