@@ -89,7 +89,6 @@ def main():
         return int(model.predict(observation, deterministic=True)[0])
 
     model.imitate(proportional)
-    learners = {"controller": proportional}
     responses["table that imitates it"] = respond(greedy)
     model.learn(50_000)
     responses["after learning"] = respond(greedy)

@@ -39,9 +39,7 @@ def read_transitions(
     :raises ValueError: if the data have another form or do not fit the spaces
     """
     if isinstance(dataset, str) and Path(dataset).suffix not in (".npz", ".csv"):
-        import minari
-
-        dataset = minari.load_dataset(dataset)
+        dataset = _load_minari(dataset)
     if columns is not None and (hasattr(dataset, "iterate_episodes") or isinstance(dataset, ReplayBuffer)):
         raise ValueError(
             f"columns are told for files and mappings; got {shown(columns)} for a {type(dataset).__name__}"
@@ -88,6 +86,17 @@ def record(env: VecEnv, act: Callable[[np.ndarray], np.ndarray], n_steps: int) -
         part.ended[-1] = True
     joined = Transitions(*map(np.concatenate, zip(*parts, strict=True)))
     return joined, float(np.mean(returns)) if returns else float("nan")
+
+
+def _load_minari(name: str) -> Any:
+    try:
+        import minari
+    except ImportError as error:
+        raise ImportError(
+            f'dataset: {name!r} is taken to be a Minari dataset, which needs: pip install "sb3-knntd[data]". Files end in '
+            ".npz or .csv"
+        ) from error
+    return minari.load_dataset(name)
 
 
 def _from_minari(dataset: Any) -> Iterator[Transitions]:
@@ -147,7 +156,7 @@ def _read_log(dataset: Any) -> Mapping[str, Any]:
         with np.load(path, allow_pickle=False) as arrays:
             return dict(arrays)
     if path.suffix != ".csv":
-        raise ValueError(f"dataset: a file must be .npz or .csv; got {path}")
+        raise ValueError(f"dataset: a file must be a .npz or a .csv; got {path}")
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     try:

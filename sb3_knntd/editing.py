@@ -167,29 +167,22 @@ class TableEditing:
             self.rules.clear()
             self.table.version += 1
 
-    def doubt(self, observations: np.ndarray, columns: np.ndarray, next_observations: np.ndarray, value: float) -> None:
+    def doubt(self, observations: np.ndarray, value: float) -> None:
         """
-        Set the entries that have not been learned, and that given data do not try either, to a low value; in a hashed
-        table only those of the points near the data.
+        Set the entries that have not been learned to a low value; in a hashed table those of the points near given
+        observations, as it has no others.
 
         :param observations: shape (n, *obs_shape), observation units
-        :param columns: the columns of the actions tried there, shape (n, n_factors), int64
-        :param next_observations: the observations that followed, shape (n, *obs_shape), observation units
         :param value: their new value
         """
-        perceptions = [self._nearest(array) for array in (observations, next_observations)]
         if isinstance(self.table, DenseTable):
             points = np.arange(len(self.table.values))
         else:
-            points = np.unique(np.concatenate(perceptions))
-        tried = np.zeros((len(points), self.table.n_actions), np.bool_)
-        places = np.searchsorted(points, perceptions[0])
-        for factor in range(columns.shape[1]):
-            tried[places, columns[:, [factor]]] = True
+            parts = np.array_split(observations, -(-len(observations) // BATCH))
+            points = np.unique(np.concatenate([self.perceive(part).indices.numpy() for part in parts]))
         with self.table.lock:
             rows = self.table.rows(self._at(points)[None])[0]
-            unknown = (rows == self.table.initial_value) & ~th.from_numpy(tried).to(rows.device)
-            self.table.write(self._at(points), rows.masked_fill(unknown, value))
+            self.table.write(self._at(points), rows.masked_fill(rows == self.table.initial_value, value))
 
     def take_over(self, before: TableEditing, measured: bool) -> None:
         """
@@ -218,10 +211,6 @@ class TableEditing:
             if isinstance(table, DenseTable):
                 table.visit(at[learned])
         table.version += 1
-
-    def _nearest(self, observations: np.ndarray) -> np.ndarray:
-        parts = np.array_split(observations, -(-len(observations) // BATCH))
-        return np.concatenate([self.perceive(part).indices.cpu().numpy() for part in parts])
 
     def _columns_in(self, action: Any) -> np.ndarray:
         """The columns of given actions, shape (n_columns,), bool."""

@@ -61,9 +61,9 @@ class OfflineLearning(SavedAlgorithm):
         Learn off-policy from logged data, by Watkins's Q(λ) with the learning rate and λ of the model; their schedules
         run from the first pass to the last. ``learn`` can go on from there.
 
-        Actions that the data never try near a point, and points that they never visit, get the lowest return in the
-        data as their value, unless they have been learned or their value is lower: without data nothing speaks for
-        them. The range of unbounded observation dimensions is measured on the data.
+        Values that have not been learned yet begin at the lowest return in the data, if that is lower: where there are
+        no data, nothing speaks for an action, and it must not be the best one. The range of unbounded observation
+        dimensions is measured on the data.
 
         :param dataset: a Minari dataset, or the name of a local one; an SB3 ReplayBuffer; a ``.npz`` or ``.csv`` file;
             or a mapping of names to arrays, such as a dict or a pandas DataFrame. Rows are in temporal order
@@ -160,7 +160,7 @@ class OfflineLearning(SavedAlgorithm):
         first = int(self.action_space.start) if isinstance(self.action_space, spaces.Discrete) else None
         actions = transitions.actions.reshape(len(transitions.rewards), -1) if first is None else transitions.actions
         transitions = transitions._replace(actions=actions - (first or 0))
-        columns = transitions.columns(policy.selector, policy.perceiver.bounds.obs_dim)
+        transitions.columns(policy.selector, policy.perceiver.bounds.obs_dim)
         seen = np.concatenate((transitions.observations, transitions.next_observations))
         if self._n_measured < steps_to_measure(self.n_envs) and policy.perceiver.bounds.is_open:
             policy.perceiver.measure(th.from_numpy(seen).to(self.device))
@@ -170,7 +170,7 @@ class OfflineLearning(SavedAlgorithm):
             policy.widen(th.from_numpy(seen).to(self.device))
             self._abandon_episodes()
         lowest = min(policy.table.initial_value, _lowest_return(transitions, self.gamma))
-        policy.doubt(transitions.observations, columns, transitions.next_observations, lowest)
+        policy.doubt(seen, lowest)
         for number in range(passes):
             progress = 1.0 - number / max(passes - 1, 1)
             self.learner.update(transitions, self.lr_schedule(progress), self.trace_schedule(progress))

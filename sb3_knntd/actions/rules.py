@@ -29,12 +29,15 @@ class Rules(nn.Module):
         super().__init__()
         #: incremented whenever the rules change
         self.version = 0
+        # Plain numbers: while torch traces, the sizes of tensors are tensors.
+        self._obs_dim = obs_dim
+        self._n_rules = 0
         self.register_buffer("low", th.empty((0, obs_dim), dtype=th.float64))
         self.register_buffer("high", th.empty((0, obs_dim), dtype=th.float64))
         self.register_buffer("columns", th.empty((0, n_columns), dtype=th.bool))
 
     def __len__(self) -> int:
-        return int(self.low.shape[0])
+        return self._n_rules
 
     def extra_repr(self) -> str:
         return "\n".join(
@@ -71,6 +74,7 @@ class Rules(nn.Module):
     def _set(self, low: th.Tensor, high: th.Tensor, columns: th.Tensor) -> None:
         device = self.low.device
         self.low, self.high, self.columns = low.to(device), high.to(device), columns.to(device)
+        self._n_rules = len(low)
         self.version += 1
 
     def forbidden(self, observations: th.Tensor) -> th.Tensor:
@@ -80,7 +84,7 @@ class Rules(nn.Module):
         """
         if not len(self):
             return th.zeros((len(observations), self.columns.shape[1]), dtype=th.bool, device=self.low.device)
-        seen = observations.reshape(-1, 1, self.low.shape[1]).to(self.low)
+        seen = observations.reshape(-1, 1, self._obs_dim).to(self.low)
         inside = ((self.low <= seen) & (seen <= self.high)).all(dim=2)
         return (inside[..., None] & self.columns).any(dim=1)
 
