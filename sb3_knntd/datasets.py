@@ -93,8 +93,8 @@ def _load_minari(name: str) -> Any:
         import minari
     except ImportError as error:
         raise ImportError(
-            f'dataset: {name!r} is taken to be a Minari dataset, which needs: pip install "sb3-knntd[data]". Files end in '
-            ".npz or .csv"
+            f'dataset: {name!r} is taken to be a Minari dataset, which needs: pip install "sb3-knntd[data]". Files end '
+            "in .npz or .csv"
         ) from error
     return minari.load_dataset(name)
 
