@@ -3,8 +3,8 @@ Correct a learned table by hand: forbid an action in a region, and set values at
 
     python examples/correct_table.py correct_table.png
 
-The table has learned Mountain-Car. Then pushing towards the wall on the left is forbidden, and where the car rolls right
-through the valley, pushing right is made the best action.
+The table has learned Mountain-Car. Then pushing towards the wall on the left is forbidden, and where the car rolls
+right through the valley, pushing right is made the best action.
 """
 
 import sys

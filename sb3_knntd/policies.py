@@ -43,7 +43,8 @@ class KNNPolicy(TableEditing, BasePolicy):
     :param lr_schedule: has no effect, part of SB3's signature
     :param n_neighbors: k, or ``"auto"``: 2 obs_dim + 1, a point and its neighbours along each axis; 1 for all but a Box
     :param points: ``"auto"``, an int, one int per dimension, or an array (n_points, obs_dim) in observation units
-    :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
+    :param bounds: ``None``, ``"adaptive"``, (low, high), arrays of shape (obs_dim,) in observation units, or a dict of
+        dimensions and their (low, high)
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
         weights (batch, k)
     :param bandwidth: h of the weights, scaled units
