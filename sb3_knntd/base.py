@@ -76,7 +76,6 @@ class KNNAlgorithm(OfflineLearning):
     initial_value: Any = FixedHyperparameter()
 
     _is_set_up = False
-    _rules_version = 0
     #: a schedule, and its value if that is constant
     _constant_trace: tuple[Any, float | None] = (None, None)
     #: Type of the supported action spaces, and advice for unsupported ones.
@@ -406,11 +405,8 @@ class KNNAlgorithm(OfflineLearning):
         if self._measuring:
             return self.policy.fit_actions(self._random_actions())
         learner = self.learner
-        if learner.selector.rules.version != self._rules_version:
-            # The next action may be forbidden now.
-            self._abandon_episodes()
-            self._rules_version = learner.selector.rules.version
-        if not learner.in_episodes:
+        # Where the rules have changed, the next action may be forbidden.
+        if not learner.in_episodes or learner.rules_version != learner.selector.rules.version:
             assert isinstance(self._last_obs, np.ndarray)
             learner.begin(self._last_obs, self._rates()[2])
         return self.policy.fit_actions(learner.actions)

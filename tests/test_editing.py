@@ -264,6 +264,25 @@ def test_a_rule_applies_from_the_next_action_on() -> None:
     assert set(np.concatenate(free.actions).tolist()) == {0, 1, 2}
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("algorithm", [KNNTD, ExA])
+def test_training_under_rules_is_resumed_exactly(
+    algorithm: type[Model], compiled: bool, tmp_path: pathlib.Path
+) -> None:
+    def begin() -> Model:
+        model = make(algorithm, policy_kwargs={"compiled": compiled}, initial_value=1.0)
+        for region in ({1: (0.0, 0.5)}, {0: (-np.inf, -0.2)}):
+            model.policy.forbid(0 if algorithm is KNNTD else {0: (-1.0, -0.5)}, region)
+        return model.learn(37)
+
+    whole, broken = begin(), begin()
+    broken.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env=broken.get_env(), force_reset=False)
+    for model in (whole, loaded):
+        model.learn(80, reset_num_timesteps=False)
+    assert th.equal(whole.policy.q_table, loaded.policy.q_table)
+
+
 @pytest.mark.parametrize("algorithm", [KNNTD, ExA])
 def test_rules_are_saved(algorithm: type[Model], tmp_path: pathlib.Path) -> None:
     model = make(algorithm).learn(150)

@@ -114,6 +114,8 @@ class Learner(ABC):
 
     #: whether the state of the episodes is known; if not, call :meth:`begin`
     in_episodes = False
+    #: version of the rules that the current actions obey
+    rules_version = 0
 
     def __init__(
         self, perceiver: Perceiver, table: QTable, selector: ActionSelector, n_envs: int, config: UpdateConfig
@@ -234,6 +236,7 @@ class Learner(ABC):
         self._forget()
         self.in_episodes = in_episodes
         if in_episodes:
+            self.rules_version = self.selector.rules.version
             self._take_over(state_dict)
 
     @abstractmethod

@@ -196,6 +196,7 @@ class CompiledLearner(Learner):
             td.begin(self._workplace.state, seen, self.stream.next()[:, 0], exploration_rate)
         self._workplace.work.trace_bound[0] = 0.0
         self.in_episodes = True
+        self.rules_version = self.selector.rules.version
 
     def step(
         self,

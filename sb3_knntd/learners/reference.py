@@ -82,6 +82,7 @@ class TorchLearner(Learner):
 
     def begin(self, observations: np.ndarray, exploration_rate: float) -> None:
         check_finite("an observation", observations, range(self.n_envs))
+        self.rules_version = self.selector.rules.version
         uniforms = self.stream.next()[:, 0]
         self._follow_table()
         self.traces.clear()
