@@ -149,7 +149,7 @@ class TableEditing:
         """
         space = self.observation_space
         obs_dim = self.perceiver.bounds.obs_dim
-        low, high = check_box("region", region, np.full(obs_dim, -np.inf), np.full(obs_dim, np.inf))
+        low, high = check_box("region", region, np.full(obs_dim, -np.inf), np.full(obs_dim, np.inf), thin=True)
         if np.isnan([low, high]).any():
             raise ValueError(f"region: an end must be a number, or infinite; got {shown(region)}")
         if isinstance(space, spaces.Box):
@@ -220,7 +220,7 @@ class TableEditing:
             return columns
         points, factors = self.columns.points, self.columns.factors
         n_dims = points.shape[1]
-        low, high = check_box("action", action, np.full(n_dims, -np.inf), np.full(n_dims, np.inf))
+        low, high = check_box("action", action, np.full(n_dims, -np.inf), np.full(n_dims, np.inf), thin=True)
         inside = (low <= points) & (points <= high)
         if len(factors) == 2:
             columns |= inside.all(axis=1)

@@ -254,18 +254,20 @@ def fill(observation: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return np.clip([opening], 0.0, 1.0).astype(np.float32)
 
 
-TASKS: list[tuple[str, Act, type[KNNTD | ExA], dict[str, Any], int]] = [
+def any_torque(observation: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return random.uniform(-2.0, 2.0, 1).astype(np.float32)
+
+
+def any_opening(observation: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return random.uniform(0.0, 1.0, 1).astype(np.float32)
+
+
+TASKS = [
     ("CartPole-v1", any_push, KNNTD, {}, 10_000),
     ("CartPole-v1", turning, KNNTD, {}, 20_000),
-    ("Pendulum-v1", lambda observation, random: random.uniform(-2.0, 2.0, 1).astype(np.float32), ExA, {}, 20_000),
+    pytest.param("Pendulum-v1", any_torque, ExA, {}, 20_000, marks=pytest.mark.slow),
     ("Pendulum-v1", swing, ExA, {}, 20_000),
-    (
-        "Tank-v0",
-        lambda observation, random: random.uniform(0.0, 1.0, 1).astype(np.float32),
-        ExA,
-        {"gamma": 0.9},
-        20_000,
-    ),
+    pytest.param("Tank-v0", any_opening, ExA, {"gamma": 0.9}, 20_000, marks=pytest.mark.slow),
     ("Tank-v0", fill, ExA, {"gamma": 0.9}, 20_000),
 ]
 

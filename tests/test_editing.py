@@ -117,6 +117,14 @@ def test_imitate_makes_a_controller_greedy(arguments: dict[str, Any]) -> None:
     np.testing.assert_allclose(values, [-1.0, -1.0, 0.0], atol=1e-9)
 
 
+def test_imitate_a_continuous_controller() -> None:
+    model = ExA("MountainCarContinuous-v0", seed=0)
+    model.policy.imitate(lambda observation: np.array([1.0 if observation[1] > 0.0 else -1.0], np.float32))
+    states = np.random.default_rng(1).uniform([-1.2, -0.07], [0.6, 0.07], (500, 2)).astype(np.float32)
+    states = states[np.abs(states[:, 1]) > 0.01]
+    np.testing.assert_allclose(model.predict(states, deterministic=True)[0][:, 0], np.sign(states[:, 1]), atol=1e-6)
+
+
 def test_a_model_imitates_another_one() -> None:
     teacher = KNNTD("MountainCar-v0", seed=0)
     teacher.policy.imitate(push)
@@ -356,6 +364,17 @@ def test_components_of_a_factored_table_are_forbidden_one_at_a_time() -> None:
     assert (taken.inside(2, 0.0, np.inf)[:, 1] <= 1e-6).all()
     with pytest.raises(ValueError, match="one component"):
         model.policy.forbid({0: (1.0, 2.0), 1: (1.0, 2.0)}, {})
+
+
+def test_an_action_is_forbidden_in_one_state() -> None:
+    model = KNNTD("FrozenLake-v1", seed=0)
+    model.policy.forbid([1, 2], {0: (4, 4)})
+    taken = Taken()
+    model.learn(3000, callback=taken)
+    states, actions = np.concatenate(taken.states), np.concatenate(taken.actions)
+    assert set(actions[states == 4].tolist()) == {0, 3}
+    assert set(actions[states == 0].tolist()) == {0, 1, 2, 3}
+    assert model.predict(4, deterministic=True)[0] in (0, 3)
 
 
 def test_the_random_phase_obeys_the_rules() -> None:

@@ -211,7 +211,7 @@ def make_bounds(bounds: Any, observation_space: spaces.Space[Any], *, from_space
 
 
 def check_box(
-    name: str, value: Any, low: np.ndarray, high: np.ndarray, also: str = ""
+    name: str, value: Any, low: np.ndarray, high: np.ndarray, also: str = "", thin: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     :param name: name of the argument
@@ -220,8 +220,9 @@ def check_box(
     :param low: lower bounds of the dimensions that a dict does not name, shape (n_dims,)
     :param high: upper bounds of them, shape (n_dims,)
     :param also: what else the argument may be, for the message
+    :param thin: whether low may equal high
     :return: the lower and the upper bounds, shape (n_dims,) each
-    :raises ValueError: if ``value`` has another form, a bound is finite and larger than 1e10, or low >= high somewhere
+    :raises ValueError: if ``value`` has another form, a bound is finite and larger than 1e10, or low is not below high
     """
     n_dims = len(low)
     forms = f"a pair (low, high) of {n_dims} numbers each, or a dict such as {{{n_dims - 1}: (-3.0, 3.0)}}"
@@ -248,11 +249,12 @@ def check_box(
             raise ValueError(
                 f"{name}: {end} must be at most {LARGEST_SENSIBLE_BOUND:g} in size, or infinite or NaN; got {given}"
             )
-    if np.any(given_low >= given_high):
-        dimension = int(np.argmax(given_low >= given_high))
+    wrong = given_low > given_high if thin else given_low >= given_high
+    if wrong.any():
+        dimension = int(np.argmax(wrong))
         raise ValueError(
-            f"{name}: low must be below high in every dimension; in dimension {dimension} low is "
-            f"{given_low[dimension]:g} and high is {given_high[dimension]:g}"
+            f"{name}: low must be {'at most' if thin else 'below'} high in every dimension; in dimension {dimension} "
+            f"low is {given_low[dimension]:g} and high is {given_high[dimension]:g}"
         )
     return given_low, given_high
 
