@@ -42,7 +42,7 @@ def read_transitions(
         dataset = _load_minari(dataset)
     if columns is not None and (hasattr(dataset, "iterate_episodes") or isinstance(dataset, ReplayBuffer)):
         raise ValueError(
-            f"columns are told for files and mappings; got {shown(columns)} for a {type(dataset).__name__}"
+            f"columns must be None for a {type(dataset).__name__}, which names its own; got {shown(columns)}"
         )
     if hasattr(dataset, "iterate_episodes"):
         parts = list(_from_minari(dataset))
@@ -196,7 +196,7 @@ def _from_log(log: Mapping[str, Any], columns: Mapping[str, str | Sequence[str]]
     terminated, truncated = (
         column(name).astype(bool) if is_given(name) else np.zeros(n, bool) for name in ("terminations", "truncations")
     )
-    for name, array in (("observations", observations), ("actions", actions), ("terminations", terminated)):
+    for name, array in zip(COLUMNS, (observations, actions, rewards, observations, terminated, truncated), strict=True):
         if len(array) != n:
             raise ValueError(f"columns: there are {len(array)} {name} for {n} rewards")
     ended = terminated | truncated

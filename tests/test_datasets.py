@@ -176,6 +176,7 @@ def test_data_that_do_not_fit_are_named_and_teach_nothing(steps: Steps, tmp_path
         ({**log, "observations": log["observations"][:, :2]}, None, "observations must have shape"),
         ({**log, "actions": log["actions"] + 0.5}, None, "actions"),
         ({**log, "actions": log["actions"] + 5}, None, "actions must be from 0 to 1"),
+        ({**log, "truncations": log["truncations"][:9]}, None, "9 truncations for 600 rewards"),
         ({"x": log["rewards"]}, None, "there is no 'observations' among 'x'"),
         (log, {"action": "actions"}, "columns must be of"),
         (log, {"actions": "push"}, "there is no 'push'"),
