@@ -54,7 +54,7 @@ class DynaBoxPolicy(SpacedPolicy, ExAPolicy):
     """
 
     def _greedy_selector(self) -> ActionSelector:
-        return PeakSelector(self.columns, random_ties=False)
+        return PeakSelector(self.columns, random_ties=False, rules=self.rules)
 
     def predict(
         self,

@@ -17,11 +17,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.actions.columns import ActionColumns, discrete_columns, make_action_columns
 from sb3_knntd.actions.exploration import EpsilonGreedy
+from sb3_knntd.actions.rules import Rules
 from sb3_knntd.actions.selection import ActionSelector, MeanActionSelector, MeanValueSelector, mean_rows
 from sb3_knntd.common.checks import check_flag, check_number, check_path, check_size, check_word, shown
 from sb3_knntd.common.interrupts import interrupts_held
 from sb3_knntd.common.plain import loaded_class
 from sb3_knntd.common.tracing import is_traced
+from sb3_knntd.editing import TableEditing
 from sb3_knntd.export import FrozenPolicy, export_policy
 from sb3_knntd.export.shared import read_safetensors
 from sb3_knntd.kernels import jit
@@ -48,7 +50,7 @@ from sb3_knntd.q_table import DenseTable, GrowingTable, HashedTable, QTable
 DENSE_TABLE_BYTES = 2**28
 
 
-class KNNPolicy(BasePolicy):
+class KNNPolicy(TableEditing, BasePolicy):
     """
     A table of action values at points of the observation space, read as a weighted mean over the k nearest points.
 
@@ -60,7 +62,8 @@ class KNNPolicy(BasePolicy):
         units
     :param spacing: of points that grow, see :class:`~sb3_knntd.KNNTD`
     :param max_points: of points that grow, see :class:`~sb3_knntd.KNNTD`
-    :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
+    :param bounds: ``None``, ``"adaptive"``, (low, high), arrays of shape (obs_dim,) in observation units, or a dict of
+        dimensions and their (low, high)
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
         weights (batch, k)
     :param bandwidth: h of the weights, scaled units
@@ -134,6 +137,8 @@ class KNNPolicy(BasePolicy):
             self.table: QTable = self._make_growing_table(table, n_actions, initial_value, dtype)
         else:
             self.table = self._make_table(table, self.perceiver.points, n_actions, initial_value, dtype)
+        #: where actions are forbidden, see :meth:`forbid`
+        self.rules = Rules(self.perceiver.bounds.obs_dim, n_actions)
         #: selects actions; the algorithm sets one that explores
         self.selector = self._greedy_selector()
         self._reader: GreedyReader | None = None
@@ -150,7 +155,7 @@ class KNNPolicy(BasePolicy):
         return discrete_columns(int(self.action_space.n))
 
     def _greedy_selector(self) -> ActionSelector:
-        return MeanValueSelector(self.columns, Target.SARSA, EpsilonGreedy(), random_ties=False)
+        return MeanValueSelector(self.columns, Target.SARSA, EpsilonGreedy(), random_ties=False, rules=self.rules)
 
     def _make_table(self, table: str, places: Points, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
         check_word("policy_kwargs: table", table, ["auto", "dense", "hashed"])
@@ -306,9 +311,10 @@ class KNNPolicy(BasePolicy):
     def q_values(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         """
         :param observation: one observation, or a batch, observation units
-        :return: Q(s, ·) = Σ p(i) Q(i, ·) (eq. 8), shape (batch, n_actions)
+        :return: Q(s, ·) = Σ p(i) Q(i, ·) (eq. 8), also of forbidden actions, shape (batch, n_actions)
         """
-        return mean_rows(*self.perceived_rows(observation))
+        perception = self.perceive(observation)
+        return mean_rows(self.table.rows(perception.indices), perception.probabilities.to(self.table.values.dtype))
 
     def state_values(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         """
@@ -321,8 +327,8 @@ class KNNPolicy(BasePolicy):
     def perceived_rows(self, observation: np.ndarray | th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param observation: one observation, or a batch, observation units
-        :return: the rows of the table at the nearest points, shape (batch, k, n_actions), and the probabilities of the
-            points, shape (batch, k)
+        :return: the rows of the table at the nearest points, with -inf at forbidden actions, shape
+            (batch, k, n_actions), and the probabilities of the points, shape (batch, k)
         """
         return self._rows(self._to_tensor(observation))
 
@@ -407,12 +413,14 @@ class KNNPolicy(BasePolicy):
 
     def _rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         perception = self._perceive(observations)
-        return self.table.rows(perception.indices), perception.probabilities.to(self.table.values.dtype)
+        probabilities = perception.probabilities.to(self.table.values.dtype)
+        return self.rules.mask(self.table.rows(perception.indices), probabilities, observations), probabilities
 
     def _exact_rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Like :meth:`_rows` in float64 for every dtype of the table, as in the kernels."""
         perception = self._perceive(observations)
-        return self.table.rows(perception.indices).double(), perception.probabilities
+        rows = self.table.rows(perception.indices).double()
+        return self.rules.mask(rows, perception.probabilities, observations), perception.probabilities
 
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> KNNPolicy:
         super()._apply(fn, recurse)
@@ -576,7 +584,9 @@ class ExAPolicy(KNNPolicy):
         return self.selector.columns_of(np.asarray(actions).reshape(len(actions), -1))
 
     def _greedy_selector(self) -> ActionSelector:
-        return MeanActionSelector(self.columns, Exploration.SHARED, 1.0, 0.0, self.n_neighbors, random_ties=False)
+        return MeanActionSelector(
+            self.columns, Exploration.SHARED, 1.0, 0.0, self.n_neighbors, random_ties=False, rules=self.rules
+        )
 
     def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         points = self.columns.points[action_indices].sum(axis=2)

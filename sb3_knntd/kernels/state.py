@@ -51,6 +51,7 @@ class EpisodeArrays(NamedTuple):
     :param current_observations: the observation before the step, shape (n_envs, obs_dim); infinite if unknown
     :param persistent: columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (n_envs, n_factors), int64
     :param lengths: see :func:`~sb3_knntd.kernels.selection.count_steps`
+    :param forbidden: the columns that the rules forbid, shape (3, n_envs, n_actions), bool, with the states as above
     """
 
     indices: np.ndarray
@@ -62,6 +63,7 @@ class EpisodeArrays(NamedTuple):
     current_observations: np.ndarray
     persistent: np.ndarray
     lengths: np.ndarray
+    forbidden: np.ndarray
 
 
 class RandomRows(NamedTuple):

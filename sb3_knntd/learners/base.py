@@ -116,6 +116,8 @@ class Learner(ABC):
 
     #: whether the state of the episodes is known; if not, call :meth:`begin`
     in_episodes = False
+    #: version of the rules that the current actions obey
+    rules_version = 0
 
     def __init__(
         self,
@@ -197,8 +199,12 @@ class Learner(ABC):
         seen = np.concatenate((observations, list(truncated.values()))) if truncated else observations
         grow(self.perceiver, self.table, seen)
 
-    def _grow_for(self, transitions: Transitions) -> None:
-        """Make points of given observations as if they had been visited."""
+    def grow_for(self, transitions: Transitions) -> None:
+        """
+        Make points of given observations as if they had been visited, if the points grow.
+
+        :param transitions: the transitions
+        """
         points = self.perceiver.points
         if not isinstance(points, GrowingPoints):
             return
@@ -265,10 +271,13 @@ class Learner(ABC):
             # All zeros if it was saved outside of episodes. Then the rest is not used, and may be of dropped points.
             in_episodes = bool(probabilities.any())
         if in_episodes:
+            # Files of versions without rules do not have it.
+            state_dict = {"forbidden": th.zeros(self.n_envs, self.table.n_actions, dtype=th.bool), **state_dict}
             self._check_state(state_dict)
         self._forget()
         self.in_episodes = in_episodes
         if in_episodes:
+            self.rules_version = self.selector.rules.version
             self._take_over(state_dict)
 
     def _observations_in(self, state_dict: dict[str, Any]) -> th.Tensor:
@@ -299,6 +308,7 @@ class Learner(ABC):
         if "observations" in state:
             shape = n_envs, self.perceiver.bounds.obs_dim
             checked_tensor(state, "observations", shape, th.float64, finite=False)
+        checked_tensor(state, "forbidden", (n_envs, n_actions), th.bool)
         traces, rows = entry(state, "traces"), self.table.points()
         active = checked_points(traces, "points", n_points)
         if rows is not None and not th.isin(active, rows).all():

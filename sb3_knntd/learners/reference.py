@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_knntd.actions.rules import masked
 from sb3_knntd.actions.selection import ActionSelector, Selection
 from sb3_knntd.common.checks import check_finite
 from sb3_knntd.common.random_stream import RandomStream
@@ -57,6 +58,8 @@ class TorchLearner(Learner):
         self.action_indices = th.zeros(self.shape, dtype=th.int64, device=values.device)
         #: persistent actions, see :meth:`~sb3_knntd.actions.selection.ActionSelector.persist`
         self.persistent = th.full((n_envs, n_factors), UNDRAWN, dtype=th.int64, device=values.device)
+        #: the columns that the rules forbid in the current states
+        self.forbidden = th.zeros((n_envs, table.n_actions), dtype=th.bool, device=values.device)
         #: see :func:`~sb3_knntd.kernels.selection.count_steps`; on the CPU, like ``ended``
         self.lengths = np.zeros(1 + n_envs)
         self._observations = th.full((n_envs, perceiver.bounds.obs_dim), th.inf, dtype=th.float64)
@@ -82,6 +85,7 @@ class TorchLearner(Learner):
 
     def begin(self, observations: np.ndarray, exploration_rate: float) -> None:
         check_finite("an observation", observations, range(self.n_envs))
+        self.rules_version = self.selector.rules.version
         uniforms = self.stream.next()[:, 0]
         self._grow(observations, {})
         self._follow_table()
@@ -90,7 +94,7 @@ class TorchLearner(Learner):
         self._persist(UNDRAWN, uniforms, exploration_rate)
         perception, selection = self._select(observations, uniforms, exploration_rate, self.persistent)
         self._observations = self._tensor(observations).reshape(self.n_envs, -1)
-        self._advance(perception, selection)
+        self._advance(observations, perception, selection)
 
     def step(
         self,
@@ -135,7 +139,7 @@ class TorchLearner(Learner):
         self._n_sums += self.n_envs
         before, self._observations = self._observations, self._tensor(observations).reshape(self.n_envs, -1)
         self.experience.record(before, self._observations, self._tensor(rewards), over, self.perceiver.bounds)
-        self._advance(perception, selection)
+        self._advance(observations, perception, selection)
 
     def _update(
         self,
@@ -172,7 +176,7 @@ class TorchLearner(Learner):
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         rates = update_rates(learning_rate, trace_decay)
         columns = transitions.columns(self.selector, self.perceiver.bounds.obs_dim)
-        self._grow_for(transitions)
+        self.grow_for(transitions)
         with self.table.lock:
             self._follow_table()
             traces = self._make_traces(1)
@@ -186,14 +190,14 @@ class TorchLearner(Learner):
     ) -> bool:
         """Learn from one transition; whether the next one continues it."""
         device = self.indices.device
-        rows, probabilities, indices = self._rows_at(transitions.observations[t])
-        next_rows, next_probabilities, _ = self._rows_at(transitions.next_observations[t])
+        rows, allowed, probabilities, indices = self._rows_at(transitions.observations[t])
+        _, next_rows, next_probabilities, _ = self._rows_at(transitions.next_observations[t])
         given = self.selector.given_value(rows, probabilities, column[None].to(device))
-        greedy = self.selector.greedy_value(rows, probabilities)
+        greedy = self.selector.greedy_value(allowed, probabilities)
         if goes_on and bool(given < greedy):
             traces.clear()
         action_indices = column.to(device).expand(1, rows.shape[1], len(column))
-        value = self.selector.value(rows, probabilities, action_indices)
+        value = self.selector.value(rows, probabilities, action_indices, allowed)
         target = self.selector.greedy_value(next_rows, next_probabilities) * float(not transitions.terminated[t])
         errors = float(transitions.rewards[t]) + self.config.gamma * target - value
         over = th.tensor([bool(transitions.ended[t])], device=device)
@@ -201,10 +205,13 @@ class TorchLearner(Learner):
         self.table.visit(indices)
         return not transitions.ended[t]
 
-    def _rows_at(self, observation: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        perception = self.perceiver(self._tensor(np.asarray(observation)[None]))
+    def _rows_at(self, observation: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+        """The rows of the neighbours, the same without forbidden actions, the probabilities and the neighbours."""
+        seen = self._tensor(np.asarray(observation)[None])
+        perception = self.perceiver(seen)
         rows = self.table.rows(perception.indices)
-        return rows, perception.probabilities.to(rows.dtype), perception.indices
+        probabilities = perception.probabilities.to(rows.dtype)
+        return rows, self.selector.rules.mask(rows, probabilities, seen), probabilities, perception.indices
 
     def _follow_table(self) -> None:
         """Make new traces if the number of rows of the table has changed; if it has grown, the old ones are kept."""
@@ -236,6 +243,7 @@ class TorchLearner(Learner):
             "held": self.persistent.cpu(),
             "lengths": th.from_numpy(self.lengths.copy()),
             "observations": self._observations.double().cpu(),
+            "forbidden": self.forbidden.cpu(),
             "traces": self.traces.state(),
         }
 
@@ -250,6 +258,7 @@ class TorchLearner(Learner):
         self.persistent.copy_(state_dict["held"])
         self.lengths[:] = state_dict["lengths"].numpy()
         self._observations = self._observations_in(state_dict).to(self.indices.device)
+        self.forbidden.copy_(state_dict["forbidden"])
         self.traces.set_state(state_dict["traces"])
         actions = self.selector.actions_of(self.action_indices, self.probabilities)
         self._actions = actions.cpu().numpy()
@@ -262,18 +271,23 @@ class TorchLearner(Learner):
     def _select(
         self, observations: np.ndarray, uniforms: np.ndarray, rate: float, persistent: th.Tensor
     ) -> tuple[Perception, Selection]:
-        perception = self.perceiver(self._tensor(observations))
+        seen = self._tensor(observations)
+        perception = self.perceiver(seen)
         probabilities = perception.probabilities.to(self.table.values.dtype)
-        rows = self.table.rows(perception.indices)
+        rows = self.selector.rules.mask(self.table.rows(perception.indices), probabilities, seen)
         selection = self.selector.select(rows, probabilities, self._tensor(uniforms), rate, persistent)
         return Perception(perception.indices, probabilities), selection
 
     def _value(self) -> th.Tensor:
         """Q(s, a) at the current state and action of each environment, shape (n_envs,)."""
-        return self.selector.value(self.table.rows(self.indices), self.probabilities, self.action_indices)
+        rows = self.table.rows(self.indices)
+        allowed = masked(rows, self.probabilities, self.forbidden) if len(self.selector.rules) else rows
+        return self.selector.value(rows, self.probabilities, self.action_indices, allowed)
 
-    def _advance(self, perception: Perception, selection: Selection) -> None:
+    def _advance(self, observations: np.ndarray, perception: Perception, selection: Selection) -> None:
         self.in_episodes = True
+        if len(self.selector.rules):
+            self.forbidden.copy_(self.selector.rules.forbidden(self._tensor(observations)))
         self.indices.copy_(perception.indices)
         self.probabilities.copy_(perception.probabilities)
         self.action_indices.copy_(selection.action_indices)

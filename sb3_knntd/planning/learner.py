@@ -85,6 +85,7 @@ class DynaLearner(Learner):
         for row in rows:
             self.planner.begin(row)
         self.in_episodes = True
+        self.rules_version = self.selector.rules.version
         self._select()
 
     def step(
@@ -138,13 +139,18 @@ class DynaLearner(Learner):
         self._since_plan += self.n_envs
         self._steps_since_summary += self.n_envs
         if self._since_plan >= PLAN_EVERY or ended.any():
-            self._plan()
+            self.plan(self._since_plan)
         self._select()
 
-    def _plan(self) -> None:
+    def plan(self, n_steps: int) -> None:
+        """
+        Plan with what has been learned.
+
+        :param n_steps: the number of steps of the environment that the simulated ones are counted by
+        """
         started = time.perf_counter()
         seed = int(self._stream.next().reshape(-1)[0] * 2**53)
-        self.planner.plan(self._since_plan, seed)
+        self.planner.plan(n_steps, seed)
         self._since_plan = 0
         self._planning_seconds += time.perf_counter() - started
 
@@ -165,6 +171,7 @@ class DynaLearner(Learner):
                 each[0, : len(source)].numpy() for each in self.perceiver.perceive_one(observation)
             )
             values[env] = probabilities @ source[indices]
+        values[self.selector.rules.forbidden(th.from_numpy(self._observations)).numpy()] = -np.inf
         self._columns[:] = pick_best(values, uniforms[:, 1])
         if self._is_box:
             self._vectors[:] = self.policy.columns.points[self._columns]
@@ -174,9 +181,9 @@ class DynaLearner(Learner):
                 self._vectors[greedy] = self.selector.peak(th.from_numpy(values[greedy]), best).numpy()  # type: ignore[attr-defined]
 
     def _select_random(self, uniforms: np.ndarray) -> None:
-        due = self._rest <= 0
-        drawn = (uniforms[:, 2] * self.table.n_actions).astype(np.int64)
-        self._columns[due] = drawn[due]
+        forbidden = self.selector.rules.forbidden(th.from_numpy(self._observations)).numpy()
+        due = (self._rest <= 0) | forbidden[np.arange(self.n_envs), self._columns]
+        self._columns[due] = pick_best(np.where(forbidden, -np.inf, 0.0), uniforms[:, 2])[due]
         self._rest[due] = 1 + (uniforms[due, 3] * LONGEST_RANDOM_HOLD).astype(np.int64)
         self._vectors[:] = self.policy.columns.points[self._columns]
 
@@ -201,7 +208,7 @@ class DynaLearner(Learner):
             is_first = bool(transitions.ended[i])
             self._since_plan += 1
             if self._since_plan >= PLAN_EVERY:
-                self._plan()
+                self.plan(self._since_plan)
 
     # -------------------------------------------------------- logging, saving
 

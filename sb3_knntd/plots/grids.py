@@ -9,7 +9,6 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_knntd.actions.selection import mean_rows
 from sb3_knntd.common.checks import check_integer, check_number, shown
 from sb3_knntd.policies import TableModel
 
@@ -180,11 +179,12 @@ def _read_batch(model: TableModel, observations: np.ndarray) -> _Reading:
     policy = model.policy
     with th.no_grad():
         rows, probabilities = policy.perceived_rows(observations)
-        q_values = mean_rows(rows, probabilities)
+        q_values = policy.q_values(observations)
         selector = policy.selector
         values = selector.greedy_value(rows, probabilities)
         actions = selector.greedy_actions(rows, probabilities).cpu().numpy()
-        learned = (rows != policy.table.initial_value).flatten(1).any(dim=1)
+        # Forbidden actions are -inf in these rows, whether they have been learned or not.
+        learned = ((rows != policy.table.initial_value) & rows.isfinite()).flatten(1).any(dim=1)
     return _Reading(q_values.cpu().numpy(), values.cpu().numpy(), actions, learned.cpu().numpy())
 
 

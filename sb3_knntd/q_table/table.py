@@ -176,6 +176,22 @@ class QTable(nn.Module, ABC):
         """
 
     @abstractmethod
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        """
+        :param points: points, shape (n,), int64
+        :return: whether each has been updated by learning, shape (n,), bool
+        """
+
+    @abstractmethod
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        """
+        Set the rows of some points. All traces are dropped.
+
+        :param points: different points, shape (n,), int64
+        :param values: their values, shape (n, n_actions)
+        """
+
+    @abstractmethod
     def arrays(self) -> TableArrays:
         """
         :return: the arrays for the kernels, which share memory with this table
@@ -263,6 +279,15 @@ class DenseTable(QTable):
             grown = th.cat((self.values, values.to(self.values)))
             self.values, self.visits = grown, th.cat((self.visits, self.visits.new_zeros(len(values))))
             self.version += 1
+
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        has_visited: th.Tensor = self.counts()[points] > 0
+        return has_visited
+
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        with self.lock:
+            self.drop_traces()
+            self.values[points] = values.to(self.values)
 
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
@@ -532,6 +557,17 @@ class HashedTable(QTable):
 
     def add_rows(self, values: th.Tensor) -> None:
         raise ValueError("points can be added to a dense table only: policy_kwargs={'table': 'dense'}")
+
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        return th.isin(points, self.points())
+
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        with self.lock:
+            self._write_back()
+            others = ~th.isin(self.points(), points)
+            kept = self.values[: self.n_visited][others]
+            visits = th.cat((self.counts()[others], self.counts_at(points)))
+            self._refill(th.cat((self.points()[others], points)), th.cat((kept, values.to(kept))), visits)
 
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
