@@ -48,6 +48,15 @@ class FromFive(DriftEnv):
         return super().step(action - 5)
 
 
+def ruled(model: KNNTD | ExA) -> KNNTD | ExA:
+    """The model, with actions forbidden in two regions that overlap."""
+    low, high = DriftEnv.LOW, DriftEnv.HIGH
+    continuous = isinstance(model, ExA)
+    model.policy.forbid({0: (0.5, 1.0)} if continuous else 0, {0: (low[0], 0.3 * high[0])})
+    model.policy.forbid({0: (-1.0, -0.5)} if continuous else 1, {1: (0.0, np.inf)})
+    return model
+
+
 def grown() -> KNNTD:
     """A model whose points were added to after it had learned, and that learned on."""
     model = KNNTD(DriftEnv(), points=SCATTERED, **GIVEN).learn(500)
@@ -59,6 +68,8 @@ def grown() -> KNNTD:
 MAKERS: dict[str, Callable[[], KNNTD | ExA]] = {
     "lattice": lambda: KNNTD(DriftEnv(), points=(20, 17), **GIVEN).learn(2_000),
     "gaussian": lambda: KNNTD(DriftEnv(), weights="gaussian", bandwidth=0.2, **GIVEN).learn(1_000),
+    "forbidden": lambda: ruled(KNNTD(DriftEnv(), points=(9, 7), **GIVEN).learn(1_000)),
+    "forbidden, continuous": lambda: ruled(ExA(PushEnv(), points=(9, 7), **GIVEN).learn(1_000)),
     "untrained": lambda: KNNTD(DriftEnv(), points=(4, 3), initial_value=1.5, **GIVEN),
     "scattered": lambda: KNNTD(DriftEnv(), points=SCATTERED, n_neighbors=6, **GIVEN).learn(1_000),
     "ties": lambda: KNNTD(DriftEnv(), points=np.round(SCATTERED, 1), n_neighbors=7, **GIVEN).learn(1_000),

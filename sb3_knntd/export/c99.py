@@ -95,10 +95,18 @@ class _Code:
             "twice_h2": self.number(2.0 * squared),
         }
         self.weight = WEIGHTS[weighting]
+        ruled = len(frozen.rules) > 0
+        # The last declaration of a function that selects: C99 lets a call follow.
+        declared = "unsigned char forbidden[N_COLUMNS];\n    find_forbidden(observation, forbidden);"
+        self.common |= {
+            "forbidden": ", forbidden" if ruled else "",
+            "find_forbidden": declared if ruled else "",
+        }
 
     def fill(self, template: str, **parts: object) -> str:
         """Fill in a template. A part that is empty leaves no empty lines."""
-        return re.sub(r"\n{3,}", "\n\n", Template(template).substitute(self.common, **parts))
+        filled = re.sub(r"\n +(?=\n)", "", Template(template).substitute(self.common, **parts))
+        return re.sub(r"\n{3,}", "\n\n", filled)
 
     def number(self, value: float) -> str:
         """A constant of the floating type."""
@@ -186,6 +194,10 @@ class _Code:
             nearest="    const real nearest = weights[0];" if uses_nearest else "",
             weight=self.fill(self.weight),
             act=self._act(),
+            rules=self._rules(),
+            allowed_only=" that is allowed" if len(frozen.rules) else "",
+            forbidden_parameter=", const unsigned char *forbidden" if len(frozen.rules) else "",
+            better=templates.BETTER_ALLOWED if len(frozen.rules) else templates.BETTER,
         )
 
     def _geometry(self) -> str:
@@ -211,6 +223,17 @@ class _Code:
             row_points=self.lines(map(str, self.row_points.tolist())),
             other_row=self.lines([self.number(self.frozen.initial_value)] * self.frozen.n_columns),
         )
+
+    def _rules(self) -> str:
+        rules = self.frozen.rules
+        if not len(rules):
+            return ""
+        # No number is beyond the largest one.
+        largest = float(np.finfo(self.type).max)
+        corners = (np.clip(corner.numpy(), -largest, largest) for corner in (rules.low, rules.high))
+        low, high = map(self.matrix, corners)
+        columns = ",\n".join(f"    {{{', '.join(map(str, row))}}}" for row in rules.columns.int().tolist())
+        return self.fill(templates.RULES, n_rules=len(rules), rule_low=low, rule_high=high, rule_columns=columns)
 
     def _act(self) -> str:
         frozen, space, first = self.frozen, self.frozen.action_space, self.frozen.first_action

@@ -94,12 +94,13 @@ $nearest
         weights[i] /= total;
 }
 
-/* The column from first to end - 1 with the largest value, the first of equal ones. */
-static int best_column(const real *values, int first, int end)
+$rules
+/* The column from first to end - 1 with the largest value, the first of equal ones$allowed_only. */
+static int best_column(const real *values, int first, int end$forbidden_parameter)
 {
     int column, best = first;
     for (column = first + 1; column < end; ++column)
-        if (values[column] > values[best])
+        if ($better)
             best = column;
     return best;
 }
@@ -315,8 +316,9 @@ ACT_DISCRETE = """
 int ${name}_action(const real observation[OBS_DIM])
 {
     real values[N_COLUMNS];
+    $find_forbidden
     ${name}_q_values(observation, values);
-    return ${first_action}best_column(values, 0, N_COLUMNS);
+    return ${first_action}best_column(values, 0, N_COLUMNS$forbidden);
 }
 """
 
@@ -335,8 +337,9 @@ static const real highest[ACTION_SIZE] = {$highest};
 OF_VALUES = """
     real values[N_COLUMNS];
     int j, best;
+    $find_forbidden
     ${name}_q_values(observation, values);
-    best = best_column(values, 0, N_COLUMNS);
+    best = best_column(values, 0, N_COLUMNS$forbidden);
     for (j = 0; j < ACTION_SIZE; ++j)
         action[j] = action_points[best][j];
 """
@@ -346,13 +349,14 @@ OF_ACTIONS = """
     const real *rows[N_NEIGHBORS];
     real weights[N_NEIGHBORS];
     int i, j, factor;
+    $find_forbidden
     perceive(observation, rows, weights);
     for (j = 0; j < ACTION_SIZE; ++j)
         action[j] = $zero;
     for (i = 0; i < N_NEIGHBORS; ++i) {
         real selected[ACTION_SIZE] = {$zero};
         for (factor = 0; factor < N_FACTORS; ++factor) {
-            const int best = best_column(rows[i], factors[factor], factors[factor + 1]);
+            const int best = best_column(rows[i], factors[factor], factors[factor + 1]$forbidden);
             for (j = 0; j < ACTION_SIZE; ++j)
                 selected[j] += action_points[best][j];
         }
@@ -382,3 +386,37 @@ real ${name}_action(const real observation[OBS_DIM])
     return action[0];
 }
 """
+
+RULES = """
+#define N_RULES $n_rules
+
+/* Where columns are forbidden: from these observations, to these, and which. */
+static const real rule_low[N_RULES][OBS_DIM] = {
+$rule_low
+};
+static const real rule_high[N_RULES][OBS_DIM] = {
+$rule_high
+};
+static const unsigned char rule_columns[N_RULES][N_COLUMNS] = {
+$rule_columns
+};
+
+static void find_forbidden(const real *observation, unsigned char *forbidden)
+{
+    int rule, j, column;
+    for (column = 0; column < N_COLUMNS; ++column)
+        forbidden[column] = 0;
+    for (rule = 0; rule < N_RULES; ++rule) {
+        int inside = 1;
+        for (j = 0; j < OBS_DIM; ++j)
+            inside = inside && rule_low[rule][j] <= observation[j] && observation[j] <= rule_high[rule][j];
+        for (column = 0; inside && column < N_COLUMNS; ++column)
+            if (rule_columns[rule][column])
+                forbidden[column] = 1;
+    }
+}
+"""
+
+#: How columns are compared without rules, and with them.
+BETTER = "values[column] > values[best]"
+BETTER_ALLOWED = "!forbidden[column] && (forbidden[best] || values[column] > values[best])"

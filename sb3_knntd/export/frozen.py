@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,6 +13,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_knntd.actions.columns import ActionColumns
+from sb3_knntd.actions.rules import Rules
 from sb3_knntd.actions.selection import ActionSelector
 from sb3_knntd.common.checks import check_size, check_word
 from sb3_knntd.kernels.perceive import Weighting
@@ -68,6 +70,7 @@ class FrozenPolicy:
     :param initial_value: value of points without a row
     :param combination: whether the mean of the rows selects one action, or each row one, whose mean is taken
     :param columns: the actions that the columns of the table stand for
+    :param rules: where actions are forbidden
     """
 
     observation_space: spaces.Space[Any]
@@ -84,6 +87,7 @@ class FrozenPolicy:
     initial_value: float
     combination: Combination
     columns: ActionColumns
+    rules: Rules
 
     @classmethod
     def of(
@@ -126,6 +130,7 @@ class FrozenPolicy:
                 initial_value=table.initial_value,
                 combination=Combination(selector.kernel_arguments(greedy=True).combination),
                 columns=selector.columns,
+                rules=copy.deepcopy(selector.rules).cpu(),
             )
 
     @property

@@ -122,17 +122,35 @@ class _Graph:
 
 def _outputs(graph: _Graph, frozen: FrozenPolicy) -> tuple[str, str]:
     """The actions, and the values of the columns."""
-    points, squares = _nearest(graph, frozen, _scaled(graph, frozen))
+    flat = graph.cast(graph("Reshape", "observation", graph.numbers(-1, frozen.obs_dim)), np.float64)
+    points, squares = _nearest(graph, frozen, _scaled(graph, frozen, flat))
     shares = _shares(graph, frozen, squares)
     rows = _rows(graph, frozen, points)
     parts = zip(shares, graph.split(rows, frozen.n_neighbors), strict=True)
     q_values = graph.total([graph("Mul", share, row) for share, row in parts])
-    return _actions(graph, frozen, q_values, rows, shares), q_values
+    forbidden = _forbidden(graph, frozen, flat)
+    return _actions(graph, frozen, q_values, rows, shares, forbidden), q_values
 
 
-def _scaled(graph: _Graph, frozen: FrozenPolicy) -> str:
-    flat = graph("Reshape", "observation", graph.numbers(-1, frozen.obs_dim))
-    offset = graph("Sub", graph.cast(flat, np.float64), graph.constant(frozen.low))
+def _forbidden(graph: _Graph, frozen: FrozenPolicy, flat: str) -> str | None:
+    """The forbidden columns, shape (batch, n_columns); ``None`` if nothing is forbidden anywhere."""
+    rules = frozen.rules
+    if not len(rules):
+        return None
+    seen = graph("Unsqueeze", flat, graph.numbers(1))
+    beyond = graph(
+        "Or",
+        graph("Less", seen, graph.constant(rules.low.numpy()[None])),
+        graph("Greater", seen, graph.constant(rules.high.numpy()[None])),
+    )
+    # Counts, as there are few operators of booleans.
+    n_beyond = graph("ReduceSum", graph.cast(beyond, np.float64), graph.numbers(2), keepdims=0)
+    inside = graph.cast(graph("Equal", n_beyond, graph.constant(0.0)), np.float64)
+    return graph("Greater", graph("MatMul", inside, graph.constant(rules.columns.numpy())), graph.constant(0.0))
+
+
+def _scaled(graph: _Graph, frozen: FrozenPolicy, flat: str) -> str:
+    offset = graph("Sub", flat, graph.constant(frozen.low))
     share = graph("Div", offset, graph.constant(frozen.high - frozen.low))
     scaled = graph("Sub", graph("Mul", share, graph.constant(2.0)), graph.constant(1.0))
     return graph("Clip", scaled, graph.constant(-FARTHEST), graph.constant(FARTHEST))
@@ -221,8 +239,14 @@ def _best(graph: _Graph, values: str, axis: int) -> str:
     return graph("ArgMax", values, axis=axis, keepdims=0, select_last_index=0)
 
 
-def _actions(graph: _Graph, frozen: FrozenPolicy, q_values: str, rows: str, shares: list[str]) -> str:
+def _actions(
+    graph: _Graph, frozen: FrozenPolicy, q_values: str, rows: str, shares: list[str], forbidden: str | None
+) -> str:
     space = frozen.action_space
+    if forbidden is not None:
+        never = graph.constant(-np.inf)
+        q_values = graph("Where", forbidden, never, q_values)
+        rows = graph("Where", graph("Unsqueeze", forbidden, graph.numbers(1)), never, rows)
     if frozen.first_action is not None:
         numbers = graph("Add", _best(graph, q_values, 1), graph.constant(frozen.first_action, np.int64))
         return graph.cast(numbers, space.dtype)
