@@ -12,12 +12,14 @@ from typing import Any, TypeVar
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.common.callback_dispatcher import CallbackDispatcher
 from sb3_knntd.common.checks import check_number
 from sb3_knntd.common.schedules import progress_remaining
 from sb3_knntd.common.transitions import StepCheck
+from sb3_knntd.vec_envs import as_vec_env
 
 SelfOnlineAlgorithm = TypeVar("SelfOnlineAlgorithm", bound="OnlineAlgorithm")
 
@@ -33,6 +35,11 @@ class OnlineAlgorithm(BaseAlgorithm):
     _standing: Any = None
     _acted_on: Any = None
     _step_check: StepCheck | None = None
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # SB3 knows no environments of gymnasium.vector.
+        return BaseAlgorithm._wrap_env(as_vec_env(env), verbose, monitor_wrapper)
 
     @abstractmethod
     def _act(self) -> np.ndarray:

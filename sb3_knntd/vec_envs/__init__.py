@@ -1,0 +1,8 @@
+"""VecEnvs whose environments are stepped together: those of EnvPool, of gymnasium.vector, and the paper's, compiled."""
+
+from __future__ import annotations
+
+from sb3_knntd.vec_envs.envpool import EnvPoolVecEnv
+from sb3_knntd.vec_envs.gymnasium import GymnasiumVecEnv, as_vec_env, reset_some
+
+__all__ = ["EnvPoolVecEnv", "GymnasiumVecEnv", "as_vec_env", "reset_some"]
