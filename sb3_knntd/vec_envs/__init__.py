@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
+from sb3_knntd.vec_envs.compiled import CompiledVecEnv
 from sb3_knntd.vec_envs.envpool import EnvPoolVecEnv
 from sb3_knntd.vec_envs.gymnasium import GymnasiumVecEnv, as_vec_env, reset_some
 
-__all__ = ["EnvPoolVecEnv", "GymnasiumVecEnv", "as_vec_env", "reset_some"]
+__all__ = ["CompiledVecEnv", "EnvPoolVecEnv", "GymnasiumVecEnv", "as_vec_env", "reset_some"]
