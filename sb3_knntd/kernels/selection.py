@@ -120,7 +120,9 @@ def _explore(values, uniforms, rate, exploration, random_ties, shares):
         return greedy_action(values, 0, n_actions, uniforms[1], random_ties)
     if exploration == Exploration.SOFTMAX:
         _softmax(values, rate, shares)
-        total, reached, action = shares.sum(), 0.0, 0
+        total, reached, action = 0.0, 0.0, 0
+        for candidate in range(n_actions):
+            total += shares[candidate]
         for candidate in range(n_actions):
             reached += shares[candidate]
             action = candidate
@@ -155,10 +157,11 @@ def _target_value(values, action, rate, target, exploration, shares):
 def _mean_row(indices, probabilities, state, means, row):
     """Q(s, ·) of a state (eq. 8), written into ``means``."""
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
-    means[:] = 0.0
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
+    for action in range(len(means)):
+        means[action] = 0.0
     for i in range(len(indices)):
-        read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
+        read_row(indices[i], values, row_slots, initial_value, entries, members, slots, clock, row)
         for action in range(len(means)):
             means[action] += probabilities[i] * row[action]
 
@@ -176,13 +179,14 @@ def _select_from_mean(indices, probabilities, uniforms, rate, state, action_indi
 @inlined
 def _select_from_each(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action):
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
     factors, action_points, row = state.factors, state.action_points, state.row
     k, n_factors = action_indices.shape
-    mean_action[:] = 0.0
+    for j in range(len(mean_action)):
+        mean_action[j] = 0.0
     value = 0.0
     for i in range(k):
-        read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
+        read_row(indices[i], values, row_slots, initial_value, entries, members, slots, clock, row)
         for factor in range(n_factors):
             first, end = factors[factor], factors[factor + 1]
             uniform = uniforms[2 + n_factors + i * n_factors + factor]
@@ -240,11 +244,11 @@ def greedy_and_given_value(indices, probabilities, columns, state):
         _mean_row(indices, probabilities, state, means, row)
         return largest(means, 0, len(means)), means[columns[0]]
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
     n_factors = len(columns)
     greedy, given = 0.0, 0.0
     for i in range(len(indices)):
-        read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
+        read_row(indices[i], values, row_slots, initial_value, entries, members, slots, clock, row)
         for factor in range(n_factors):
             greedy += probabilities[i] * largest(row, factors[factor], factors[factor + 1]) / n_factors
             given += probabilities[i] * row[columns[factor]] / n_factors

@@ -77,6 +77,7 @@ class WorkArrays(NamedTuple):
     """
     Work space, bounds, and sums for the log.
 
+    :param seen: an observation, shape (obs_dim,)
     :param means: shape (n_actions,)
     :param row: shape (n_actions,)
     :param target_values: shape (n_envs,)
@@ -87,6 +88,7 @@ class WorkArrays(NamedTuple):
     :param trace_bound: upper bound of the traces, shape (1,)
     """
 
+    seen: np.ndarray
     means: np.ndarray
     row: np.ndarray
     target_values: np.ndarray

@@ -67,6 +67,22 @@ def perceive_and_select(state, observation, uniforms, rate, which, env):
     return select(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action)
 
 
+@inlined
+def _look_at(observation, state):
+    """The observation as float64, so that what follows is compiled for one type."""
+    seen = state.seen
+    for j in range(len(observation)):
+        seen[j] = observation[j]
+    return seen
+
+
+@inlined
+def _undraw(persistent):
+    """Forget the persistent action."""
+    for factor in range(len(persistent)):
+        persistent[factor] = UNDRAWN
+
+
 @jit
 def begin(state, observations, uniforms, rate):
     """
@@ -77,10 +93,10 @@ def begin(state, observations, uniforms, rate):
     :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
     :param rate: ε or the temperature
     """
-    state.lengths[1:] = 0.0
     for env in range(len(observations)):
-        state.persistent[env, :] = UNDRAWN
-        perceive_and_select(state, observations[env], uniforms[env], rate, CURRENT, env)
+        state.lengths[1 + env] = 0.0
+        _undraw(state.persistent[env])
+        perceive_and_select(state, _look_at(observations[env], state), uniforms[env], rate, CURRENT, env)
 
 
 @inlined
@@ -117,7 +133,7 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
     indices, probabilities = state.indices[CURRENT], state.probabilities[CURRENT]
     chosen = state.action_indices[CURRENT]
     places, corrections, row, factors = state.places, state.corrections, state.row, state.factors
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
     n_envs, k, n_factors = chosen.shape
     size, value_sum, change = 0.0, 0.0, 0.0
@@ -129,12 +145,12 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
             if state.combination == Combination.OF_VALUES:
                 column = chosen[env, i, 0]
                 if place >= 0:
-                    value += probability * active_value(entries, place, column, clock)
+                    value += probability * active_value(entries, members, place, column, clock)
                 else:
                     value += probability * stored_value(indices[env, i], column, values, row_slots, initial_value)
             else:
                 if place >= 0:
-                    read_active_row(entries, place, clock, row)
+                    read_active_row(entries, members, place, clock, row)
                 else:
                     read_stored_row(indices[env, i], values, row_slots, initial_value, row)
                 for factor in range(n_factors):
@@ -161,13 +177,13 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
             for factor in range(n_factors):
                 entry = chosen[env, i, factor]
                 if state.accumulating:
-                    set_trace(entries, place, entry, env, entries[place, entry, env] + trace, clock)
+                    set_trace(entries, members, place, entry, env, entries[place, entry, env] + trace, clock)
                     continue
                 if state.reset_other_actions:
                     for other in range(factors[factor], factors[factor + 1]):
                         if other != entry:
-                            set_trace(entries, place, other, env, 0.0, clock)
-                set_trace(entries, place, entry, env, trace, clock)
+                            set_trace(entries, members, place, other, env, 0.0, clock)
+                set_trace(entries, members, place, entry, env, trace, clock)
     for env in range(n_envs):
         clock[1 + env] += corrections[env] * clock[0]
     clock[0] *= state.gamma * trace_decay
@@ -223,64 +239,59 @@ def _are_valid(learning_rate, trace_decay, rate, state):
     return 0.0 < rate < np.inf if state.exploration == Exploration.SOFTMAX else 0.0 <= rate <= 1.0
 
 
-@jit
-def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate):
-    """
-    Perceive the next states, select actions in them, and learn from the steps.
-
-    :param state: see :mod:`sb3_knntd.kernels.state`
-    :param observations: observation units, shape (n_envs, obs_dim)
-    :param rewards: shape (n_envs,)
-    :param ended: whether the episodes have ended, shape (n_envs,), bool
-    :param learning_rate: α
-    :param trace_decay: λ
-    :param rate: ε or the temperature
-    :return: ``OK``; or ``NEED_RANDOM``, ``NEED_CAPACITY`` or ``BAD_RATE``, in which case nothing has been changed; or
-        ``NOT_FINITE`` or ``DIVERGED``, in which case no value has been changed
-    """
-    target_values = state.target_values
-    if state.n_taken[0] == len(state.rows):
-        return NEED_RANDOM
-    if not has_capacity(state):
-        return NEED_CAPACITY
-    if not _are_valid(learning_rate, trace_decay, rate, state):
-        return BAD_RATE
-    uniforms = state.rows[state.n_taken[0]]
-    state.n_taken[0] += 1
-    count_steps(state.lengths, ended)
-    for env in range(len(rewards)):
-        if not np.isfinite(rewards[env]):
-            return NOT_FINITE
-        for j in range(observations.shape[1]):
-            if not np.isfinite(observations[env, j]):
-                return NOT_FINITE
-        if ended[env]:
-            state.persistent[env, :] = UNDRAWN
-        value = perceive_and_select(state, observations[env], uniforms[env, 0], rate, NEXT, env)
-        if state.truncated[env]:
-            value = perceive_and_select(state, state.last_observations[env], uniforms[env, 1], rate, TERMINAL, env)
-        elif ended[env]:
-            value = 0.0
-        target_values[env] = value
-    outcome = update_table(state, target_values, rewards, ended, learning_rate, trace_decay)
-    if outcome == OK:
-        _advance(state)
-    return outcome
-
-
 @cache
 def _learn_at(kind):
+    # A function for each type of state, which is found by its address: calling another compiled function here would
+    # compile all of it twice.
     @jit
-    def learn_at(address, observations, rewards, ended, learning_rate, trace_decay, rate):
-        return learn(state_at(address, kind), observations, rewards, ended, learning_rate, trace_decay, rate)
+    def learn(address, observations, rewards, ended, learning_rate, trace_decay, rate):
+        state = state_at(address, kind)
+        target_values = state.target_values
+        if state.n_taken[0] == len(state.rows):
+            return NEED_RANDOM
+        if not has_capacity(state):
+            return NEED_CAPACITY
+        if not _are_valid(learning_rate, trace_decay, rate, state):
+            return BAD_RATE
+        uniforms = state.rows[state.n_taken[0]]
+        state.n_taken[0] += 1
+        count_steps(state.lengths, ended)
+        for env in range(len(rewards)):
+            if not np.isfinite(rewards[env]):
+                return NOT_FINITE
+            for j in range(observations.shape[1]):
+                if not np.isfinite(observations[env, j]):
+                    return NOT_FINITE
+            if ended[env]:
+                _undraw(state.persistent[env])
+            seen = _look_at(observations[env], state)
+            value = perceive_and_select(state, seen, uniforms[env, 0], rate, NEXT, env)
+            if state.truncated[env]:
+                last = state.last_observations[env]
+                value = perceive_and_select(state, last, uniforms[env, 1], rate, TERMINAL, env)
+            elif ended[env]:
+                value = 0.0
+            target_values[env] = value
+        outcome = update_table(state, target_values, rewards, ended, learning_rate, trace_decay)
+        if outcome == OK:
+            _advance(state)
+        return outcome
 
-    return learn_at
+    return learn
 
 
 def learn_with(state):
     """
+    Make the function that perceives the next states, selects actions in them, and learns from the steps:
+    ``learn(observations, rewards, ended, learning_rate, trace_decay, rate)``.
+
+    It takes the observations, observation units, shape (n_envs, obs_dim); the rewards and whether the episodes have
+    ended, shape (n_envs,) each; α; λ; and ε or the temperature. It returns ``OK``; or ``NEED_RANDOM``,
+    ``NEED_CAPACITY`` or ``BAD_RATE``, in which case nothing has been changed; or ``NOT_FINITE`` or ``DIVERGED``, in
+    which case no value has been changed.
+
     :param state: see :mod:`sb3_knntd.kernels.state`; the caller must keep it alive as long as the function is used
-    :return: :func:`learn` with this state, a function of its other arguments
+    :return: the function
     """
     address, kind = address_of(state)
     return partial(_learn_at(kind), address)
