@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, Ve
 from toy_envs import DriftEnv
 
 from sb3_knntd import KNNTD
-from sb3_knntd.vec_envs import EnvPoolVecEnv, GymnasiumVecEnv
+from sb3_knntd.vec_envs import EnvPoolVecEnv, GymnasiumVecEnv, LeanVecEnv
 
 N_ENVS = 6
 MODES = list(AutoresetMode)
@@ -67,6 +67,7 @@ def test_no_transition_leads_across_a_reset(kind: str) -> None:
         actions = rng.integers(0, 2, N_ENVS)
         next_observations, rewards, dones, infos = venv.step(actions)
         assert rewards.dtype == np.float32
+        assert observations.flags.c_contiguous, "another order of memory would be compiled for anew"
         np.testing.assert_array_equal(rewards, 1.0)
         lengths += 1
         for env, info in enumerate(infos):
@@ -305,6 +306,49 @@ def test_infos_of_the_environments(mode: AutoresetMode) -> None:
         infos = [without_times(venv.step(np.array([0, 1]))[3]) for venv in (alone, together)]
         assert infos[1] == infos[0]
         assert together.reset_infos == alone.reset_infos
+
+
+class Remembers(gym.Env[np.ndarray, int]):
+    """An environment that returns the same arrays and the same info in every step."""
+
+    observation_space = gym.spaces.Box(-9.0, 9.0, (2,))
+    action_space = gym.spaces.Discrete(3)
+
+    def __init__(self) -> None:
+        self.place = np.zeros(2, np.float32)
+        self.info: dict[str, Any] = {"places": [], "last": {"place": self.place}}
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        self.place[:] = 0.0
+        return self.place, {"begun": True}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.place += action
+        self.info["places"].append(float(self.place[0]))
+        self.info["count"] = len(self.info["places"])
+        return self.place, 0.1 * action, False, bool(self.place[0] > 4), self.info
+
+
+def test_what_lean_vec_env_returned_does_not_change_later() -> None:
+    def run(kind: type[DummyVecEnv]) -> list[Any]:
+        venv = kind([Remembers, Remembers])
+        return [venv.reset(), *(venv.step(np.array([1, 2])) for _ in range(7)), venv.reset_infos]
+
+    np.testing.assert_equal(run(LeanVecEnv), run(DummyVecEnv))
+
+
+def test_models_put_single_environments_into_lean_vec_env(capsys: pytest.CaptureFixture[str]) -> None:
+    model = KNNTD("MountainCar-v0", seed=0, verbose=1)
+    assert type(model.env) is LeanVecEnv
+    assert isinstance(model.env, DummyVecEnv)
+    assert model.env.env_is_wrapped(Monitor) == [True]
+    assert capsys.readouterr().out.count("Wrapping the env") == 2
+    alone = KNNTD(DummyVecEnv([lambda: Monitor(gym.make("MountainCar-v0"))]), seed=0)
+    np.testing.assert_array_equal(model.learn(900).policy.q_table, alone.learn(900).policy.q_table)
+    dictionary = gym.wrappers.TransformObservation(
+        Remembers(), lambda seen: {"place": seen}, gym.spaces.Dict({"place": Remembers.observation_space})
+    )
+    assert LeanVecEnv([lambda: dictionary]).reset()["place"].shape == (1, 2)  # type: ignore[call-overload, index]
 
 
 @needs_envpool

@@ -21,7 +21,7 @@ NAMES = {
 }
 
 
-class CompilationProgress(event.Listener):  # type: ignore[misc]
+class CompilationProgress(event.Listener):
     """
     Listens to numba. As soon as the package's kernels have compiled for ``PATIENCE`` seconds, it says so, and then what
     is compiled and how long it took.

@@ -5,5 +5,6 @@ from __future__ import annotations
 from sb3_knntd.vec_envs.compiled import CompiledVecEnv
 from sb3_knntd.vec_envs.envpool import EnvPoolVecEnv
 from sb3_knntd.vec_envs.gymnasium import GymnasiumVecEnv, as_vec_env, reset_some
+from sb3_knntd.vec_envs.lean import LeanVecEnv
 
-__all__ = ["CompiledVecEnv", "EnvPoolVecEnv", "GymnasiumVecEnv", "as_vec_env", "reset_some"]
+__all__ = ["CompiledVecEnv", "EnvPoolVecEnv", "GymnasiumVecEnv", "LeanVecEnv", "as_vec_env", "reset_some"]

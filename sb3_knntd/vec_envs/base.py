@@ -96,7 +96,7 @@ class BatchedVecEnv(VecEnv):
         """
         :return: the first observations, shape (n_envs, *obs_shape)
         """
-        observations = self._reset_all()
+        observations = np.ascontiguousarray(self._reset_all())
         self._reset_seeds()
         self._reset_options()
         self._returns[:] = 0.0
@@ -135,7 +135,8 @@ class BatchedVecEnv(VecEnv):
             self._returns[ended] = 0.0
             self._lengths[ended] = 0
             observations[ended] = turn.first
-        return observations, rewards.astype(np.float32, copy=False), dones, infos
+        # As from SB3's VecEnvs: compiled code is made for one order of memory.
+        return np.ascontiguousarray(observations), rewards.astype(np.float32, copy=False), dones, infos
 
     def close(self) -> None:
         """Close the environments."""

@@ -120,7 +120,12 @@ class CompiledVecEnv(DummyVecEnv):
         monitor = self._wrappers[env].get(Monitor)
         if monitor is not None:
             _record(monitor, float(self._states[env, -1]), int(self._counts[env, ELAPSED]), info)
-        observations[env], self.reset_infos[env] = self.envs[env].reset()
+            monitor.needs_reset = False
+        # The wrappers have nothing to do, and would take longer than the reset itself.
+        observations[env], self.reset_infos[env] = self._cores[env].reset()
+        limit = self._wrappers[env].get(TimeLimit)
+        if limit is not None:
+            limit._elapsed_steps = 0
         self._counts[env, ELAPSED] = 0
         self._read_one(env)
 
@@ -194,7 +199,6 @@ def _record(monitor: Any, total: float, length: int, info: dict[str, Any]) -> No
     monitor.episode_lengths.append(length)
     monitor.episode_times.append(passed)
     monitor.total_steps += length
-    monitor.needs_reset = True
     episode |= monitor.current_reset_info
     if monitor.results_writer:
         monitor.results_writer.write_row(episode)
