@@ -22,29 +22,42 @@ except Exception as error:  # with an unsupported version of NumPy, numba raises
     REASON = f"{type(error).__name__}: {error}"
 
 
-def jit(function: Function, forceinline: bool = False) -> Function:
+def jit(function: Function) -> Function:
     """
     Compile a function on its first call, without the GIL, and cache the result on disk.
 
     :param function: the function
-    :param forceinline: whether to inline it into compiled functions that call it
     :return: the compiled function, or ``function`` itself without numba
     """
-    if not AVAILABLE:
-        return function
-    # Wrappers take time to compile. Nothing calls these functions from C, nor inlined ones from Python.
-    options: dict[str, Any] = {"no_cfunc_wrapper": True, "no_cpython_wrapper": forceinline}
-    compiled = numba.njit(nogil=True, forceinline=forceinline, **options)(function)
-    keep(compiled)
-    return cast(Function, compiled)
+    return _compiled(function)
 
 
-def inlined(function: Function) -> Function:
+def helper(function: Function) -> Function:
     """
-    :func:`jit`, inlined into compiled functions that call it; it cannot be called from Python. For functions called for
-    each neighbour: passing a dozen arrays takes longer than reading from them.
+    :func:`jit`, for functions that are called from compiled functions only: this takes less time to compile.
 
     :param function: the function
     :return: the compiled function, or ``function`` itself without numba
     """
-    return jit(function, forceinline=True)
+    return _compiled(function, no_cpython_wrapper=True)
+
+
+def inlined(function: Function) -> Function:
+    """
+    :func:`helper`, inlined into the functions that call it. For functions called for each neighbour: passing a dozen
+    arrays takes longer than reading from them.
+
+    :param function: the function
+    :return: the compiled function, or ``function`` itself without numba
+    """
+    return _compiled(function, no_cpython_wrapper=True, forceinline=True)
+
+
+def _compiled(function: Function, **options: Any) -> Function:
+    if not AVAILABLE:
+        return function
+    # Nothing calls these functions from C either.
+    options |= {"nogil": True, "no_cfunc_wrapper": True}
+    compiled = numba.njit(**options)(function)
+    keep(compiled)
+    return cast(Function, compiled)

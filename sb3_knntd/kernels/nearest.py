@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import jit
+from sb3_knntd.kernels.jit import helper, jit
 
 
-@jit
+@helper
 def _next_coordinate(x, axes, below, above, first, end):
     """
     Find the nearer of the next coordinates below and above x; at equal distance, the lower one.
@@ -26,7 +26,7 @@ def _next_coordinate(x, axes, below, above, first, end):
     return (below, down) if down <= up else (above, up)
 
 
-@jit
+@helper
 def _coordinates_up_to(x, axes, first, end):
     """Count the coordinates of a dimension that are at most x."""
     low, high = first, end
@@ -39,7 +39,7 @@ def _coordinates_up_to(x, axes, first, end):
     return low - first
 
 
-@jit
+@helper
 def _first_on_lattice(scaled, axes, offsets, count):
     """
     Find the ``count`` points with the smallest squared distances.
@@ -101,7 +101,7 @@ def _first_on_lattice(scaled, axes, offsets, count):
     return sums, numbers
 
 
-@jit
+@helper
 def _blurred(scaled, axes, offsets, total):
     """
     Whether rounding could make sums of about ``total`` equal for two coordinates at different distances. If not, equal

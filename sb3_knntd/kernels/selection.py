@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import inlined, jit
+from sb3_knntd.kernels.jit import helper, inlined, jit
 from sb3_knntd.kernels.traces import read_row
 
 
@@ -100,7 +100,7 @@ def greedy_action(values, first, end, uniform, random_ties):
     return best
 
 
-@jit
+@helper
 def _softmax(values, temperature, shares):
     best, total = largest(values, 0, len(values)), 0.0
     for action in range(len(values)):
@@ -228,7 +228,7 @@ def select(indices, probabilities, uniforms, rate, persistent, state, action_ind
     raise ValueError("the kernels do not know this combination")
 
 
-@jit
+@helper
 def greedy_and_given_value(indices, probabilities, columns, state):
     """
     The values of the greedy action and of a given action in a state.
@@ -255,7 +255,7 @@ def greedy_and_given_value(indices, probabilities, columns, state):
     return greedy, given
 
 
-@jit
+@helper
 def persist(uniforms, rate, lengths, env, selection, persistent):
     """
     Keep the persistent action, or redraw whether to explore and which columns. On average a draw is kept for

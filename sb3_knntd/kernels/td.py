@@ -6,7 +6,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import inlined, jit
+from sb3_knntd.kernels.jit import helper, inlined, jit
 from sb3_knntd.kernels.perceive import SearchKind, perceive
 from sb3_knntd.kernels.selection import (
     UNDRAWN,
@@ -44,7 +44,7 @@ CURRENT, NEXT, TERMINAL = 0, 1, 2
 OK, NEED_RANDOM, NEED_CAPACITY, BAD_RATE, NOT_FINITE, DIVERGED = range(6)
 
 
-@jit
+@helper
 def perceive_and_select(state, observation, uniforms, rate, which, env):
     """
     Perceive an observation and select an action. Both are stored in the state.

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import inlined, jit
+from sb3_knntd.kernels.jit import helper, inlined, jit
 
 #: Smaller traces are dropped: their effect is below the precision of a float64.
 LEAST_TRACE = 1e-18
@@ -172,7 +172,7 @@ def read_row(point, values, row_slots, initial_value, entries, members, slots, c
         read_stored_row(point, values, row_slots, initial_value, row)
 
 
-@jit
+@helper
 def activate(point, table, traces):
     """Make a point active, and add a row to the table if it has none; its place."""
     row = row_of(point, table.row_slots)
@@ -215,7 +215,7 @@ def set_trace(entries, members, place, action, env, trace, clock):
         entries[place, action, n_envs + 1] = value - active_value(entries, members, place, action, clock)
 
 
-@jit
+@helper
 def _join_or_leave(those, env, was_member, is_member):
     """Insert an environment into the members of an entry, or remove it, in ascending order."""
     if is_member and not was_member:
@@ -235,7 +235,7 @@ def _join_or_leave(those, env, was_member, is_member):
         those[0] -= 1
 
 
-@jit
+@helper
 def _reshare(entries, members, place, action):
     largest, together, those = 0.0, 0.0, members[place, action]
     for i in range(1, 1 + those[0]):
@@ -273,7 +273,7 @@ def write_back(table, traces):
             )
 
 
-@jit
+@helper
 def largest_size(table, traces):
     """The largest absolute value in the table."""
     values, clock, largest = table.values, traces.clock, 0.0
@@ -299,7 +299,7 @@ def adopt(table, traces):
             entries[place, action, entries.shape[2] - 1] += change
 
 
-@jit
+@helper
 def _rebase(entries, members, place, clock):
     """Rewrite the bases and the x of an active point for c = 1 and G = 0; whether it still has a trace."""
     n_envs, active = len(clock) - 1, False
@@ -361,7 +361,7 @@ def flush(table, traces):
     rehash(points, kept, traces.active_slots)
 
 
-@jit
+@helper
 def end_episode(env, table, traces):
     """Drop all traces of an environment."""
     clock = traces.clock
