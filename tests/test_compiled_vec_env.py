@@ -92,6 +92,8 @@ def test_environments_can_be_read_and_moved_between_steps() -> None:
         observations, _, _, _ = venv.step(np.array([2, 2]))
         np.testing.assert_allclose(observations[0], [-0.9, 0.0], atol=0.01)
         *_, infos = [venv.step(np.array([1, 1])) for _ in range(4)][-1]
+        venv.get_attr("unwrapped")[1].reward = "goal"
+        assert venv.step(np.array([1, 1]))[1].tolist() == [-1.0, 0.0]
         assert "episode" not in infos[0]
         assert infos[1]["episode"]["l"] == 9
 
@@ -137,6 +139,10 @@ class Heavier(MountainCarEnv):
         ([Heavier], "Heavier.*DummyVecEnv"),
         ([lambda: gym.make("sb3_knntd/MountainCar-v0", render_mode="human")], "window"),
         ([lambda: gym.wrappers.ClipReward(gym.make("sb3_knntd/MountainCar-v0"), -1, 1)], "ClipReward.*DummyVecEnv"),
+        (
+            [lambda: gym.make("sb3_knntd/CartPole-v0"), lambda: gym.make("sb3_knntd/CartPole-v0", track=1.0)],
+            "same spaces",
+        ),
         ([lambda: Monitor(Monitor(gym.make("sb3_knntd/MountainCar-v0")))], "Monitor"),
     ],
 )

@@ -51,12 +51,16 @@ class CompiledVecEnv(DummyVecEnv):
         if self.render_mode == "human":
             raise ValueError("CompiledVecEnv does not show its environments in a window. Use DummyVecEnv")
         first = self._cores[0]
-        self._dynamics = dynamics = DYNAMICS[type(first)]
+        for core in self._cores:
+            if core.observation_space != first.observation_space or core.action_space != first.action_space:
+                raise ValueError(
+                    f"CompiledVecEnv takes environments with the same spaces; got {first.observation_space} and "
+                    f"{core.observation_space}, {first.action_space} and {core.action_space}"
+                )
+        self._dynamics = DYNAMICS[type(first)]
         n, dim = self.num_envs, len(first._low)
-        self._choices = dynamics.choices(first)
-        self._settings = np.array([dynamics.settings(core) for core in self._cores])
+        self._choices = self._dynamics.choices(first)
         self._bounds = np.stack((first._low, first._high))
-        self._noisy = any(core._noisy for core in self._cores)
         self._pushes = np.zeros(n)
         self._states = np.zeros((n, dim + 1))
         self._counts = np.zeros((n, 3), np.int64)
@@ -135,7 +139,9 @@ class CompiledVecEnv(DummyVecEnv):
         return tuple(self._states[env, :-1].tolist())
 
     def _read(self) -> None:
-        """Take the states of the environments, which may have been changed from outside."""
+        """Take the states and settings of the environments, which may have been changed from outside."""
+        self._settings = np.array([self._dynamics.settings(core) for core in self._cores])
+        self._noisy = any(core._noisy for core in self._cores)
         for env in range(self.num_envs):
             self._read_one(env)
         self._handed_out = False
