@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 import sb3_knntd.envs  # noqa: F401
 from benchmarks.rows import Row, compare, steps_per_second
 from sb3_knntd import KNNTD, ExA
-from sb3_knntd.vec_envs import CompiledVecEnv, EnvPoolVecEnv, GymnasiumVecEnv
+from sb3_knntd.vec_envs import CompiledVecEnv, EnvPoolVecEnv, GymnasiumVecEnv, LeanVecEnv
 
 #: Number of environments that are stepped together.
 N_ENVS = 64
@@ -129,6 +129,20 @@ def compiled_against_python(repeats: int) -> list[Row]:
     ]
 
 
+def lean_against_dummy(repeats: int) -> Row:
+    def model(vec_env_cls: type[DummyVecEnv]) -> KNNTD:
+        return KNNTD(make_vec_env("MountainCar-v0", 1, seed=0, vec_env_cls=vec_env_cls), seed=0)
+
+    return compare(
+        "learn with LeanVecEnv over DummyVecEnv, MountainCar-v0, n_envs 1",
+        ">= 1",
+        continued(model(LeanVecEnv)),
+        continued(model(DummyVecEnv)),
+        4 * repeats,
+        "steps/s",
+    )
+
+
 def side_by_side(repeats: int) -> list[Row]:
     """
     The most that many seeds in one process could gain: 64 environments in one compiled call, with one table in place of
@@ -187,6 +201,7 @@ BENCHMARKS: dict[str, Callable[[int], Any]] = {
     "envpool_mountain_car": quietly(lambda repeats: against_envpool(repeats, "MountainCar-v0")),
     "envpool_ppo": quietly(against_ppo),
     "gymnasium_vector": numpy_against_python,
+    "lean": lean_against_dummy,
     "compiled": compiled_environments,
     "compiled1": compiled_against_python,
     "side_by_side": side_by_side,
