@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 from gymnasium.vector import AutoresetMode, VectorEnv
+from scipy.stats import mannwhitneyu
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
@@ -363,7 +364,5 @@ def test_learning_with_envpool_is_as_good(env_id: str) -> None:
 
     ours = returns(lambda seed: EnvPoolVecEnv(env_id, 8, seed=seed))
     theirs = returns(lambda seed: make_vec_env(env_id, 8, seed=seed))
-    # The medians lie within each other's middle nine tenths.
-    for one, other in ((ours, theirs), (theirs, ours)):
-        low, high = np.quantile(other, (0.05, 0.95))
-        assert low <= np.median(one) <= high
+    # Seeds differ; a thousandth is the chance that equal distributions do so this much.
+    assert mannwhitneyu(ours, theirs).pvalue > 0.001
