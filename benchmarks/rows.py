@@ -1,10 +1,11 @@
-"""A row of the table of `python -m benchmarks.speed`."""
+"""A row of the table of `python -m benchmarks.speed`, and how it is measured."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
-from typing import NamedTuple
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 
 class Row(NamedTuple):
@@ -42,3 +43,31 @@ class Row(NamedTuple):
         """Whether the median reaches the target."""
         sign, limit = self.target.split()
         return bool(self.ratio >= float(limit) if sign == ">=" else self.ratio <= float(limit))
+
+
+def compare(
+    what: str, target: str, one: Callable[[], float], other: Callable[[], float], repeats: int, unit: str
+) -> Row:
+    """
+    :param what: name of the comparison
+    :param target: required ratio ``one / other``
+    :param one: the first measurement
+    :param other: the second measurement
+    :param repeats: number of alternating measurements of both, after one warm-up
+    :param unit: unit of the measurements
+    """
+    one(), other()
+    pairs = [(one(), other()) for _ in range(repeats)]
+    ratios = [a / b for a, b in pairs]
+    a, b = (statistics.median(column) for column in zip(*pairs, strict=True))
+    return Row.of(what, ratios, target, f"{a:,.4g} / {b:,.4g} {unit}")
+
+
+def steps_per_second(work: Callable[[int], Any], n_steps: int) -> float:
+    """
+    :param work: function that makes a given number of environment steps
+    :param n_steps: number of steps
+    """
+    start = time.perf_counter()
+    work(n_steps)
+    return n_steps / (time.perf_counter() - start)

@@ -25,9 +25,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
+from benchmarks import throughput
 from benchmarks.cuda import against_copy
 from benchmarks.machine import describe
-from benchmarks.rows import Row
+from benchmarks.rows import Row, compare, steps_per_second
 from sb3_knntd import KNNTD, ExA
 
 
@@ -59,34 +60,6 @@ class Drift(gym.Env[np.ndarray, Any]):
         self.state = np.clip(state, -0.95, 0.95)
         self.steps += 1
         return self.state, -1.0, self.steps >= self.length, False, {}
-
-
-def compare(
-    what: str, target: str, one: Callable[[], float], other: Callable[[], float], repeats: int, unit: str
-) -> Row:
-    """
-    :param what: name of the comparison
-    :param target: required ratio ``one / other``
-    :param one: the first measurement
-    :param other: the second measurement
-    :param repeats: number of alternating measurements of both, after one warm-up
-    :param unit: unit of the measurements
-    """
-    one(), other()
-    pairs = [(one(), other()) for _ in range(repeats)]
-    ratios = [a / b for a, b in pairs]
-    a, b = (statistics.median(column) for column in zip(*pairs, strict=True))
-    return Row.of(what, ratios, target, f"{a:,.4g} / {b:,.4g} {unit}")
-
-
-def steps_per_second(work: Callable[[int], Any], n_steps: int) -> float:
-    """
-    :param work: function that makes a given number of environment steps
-    :param n_steps: number of steps
-    """
-    start = time.perf_counter()
-    work(n_steps)
-    return n_steps / (time.perf_counter() - start)
 
 
 def bare_loop(venv: VecEnv, n_steps: int) -> None:
@@ -398,6 +371,7 @@ BENCHMARKS: dict[str, Callable[[int], Row | list[Row]]] = {
     "memory32": lambda repeats: memory(repeats, th.float32),
     "growth": growth_pause,
     "cuda": cuda,
+    **throughput.BENCHMARKS,
 }
 
 

@@ -41,6 +41,7 @@ from sb3_knntd.offline import OfflineLearning
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.q_table import DenseTable
+from sb3_knntd.vec_envs import as_vec_env
 
 NONE_TRUNCATED: dict[int, np.ndarray] = {}
 #: The largest seed of NumPy's global generator.
@@ -120,8 +121,8 @@ class KNNAlgorithm(Inspectable, OfflineLearning):
         device = check_device(device)
         policy_class, env = self._sort_out(policy, env)
         if env is not None:
-            env = maybe_make_env(env, verbose)
-            self._check_spaces(env.observation_space, env.action_space)
+            env = made = as_vec_env(maybe_make_env(env, verbose))
+            self._check_spaces(made.observation_space, made.action_space)
         super().__init__(
             policy_class,
             env,
@@ -326,10 +327,11 @@ class KNNAlgorithm(Inspectable, OfflineLearning):
 
         :param env: an environment with the same spaces, or a VecEnv with the same number of environments
         :param force_reset: whether ``learn`` starts new episodes
-        :raises ValueError: if it is a class or an environment of gymnasium.vector; if only one of this environment and
-            the one that the model was made with normalises observations (VecNormalize); as in SB3, if its spaces differ
+        :raises ValueError: if it is a class; if only one of this environment and the one that the model was made with
+            normalises observations (VecNormalize); as in SB3, if its spaces differ
         """
         check_environment(type(self).__name__, env)
+        env = as_vec_env(env)
         self._check_normalization(env)
         super().set_env(env, force_reset)
 

@@ -12,12 +12,17 @@ from typing import Any, TypeVar
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
 from sb3_knntd.common.callback_dispatcher import CallbackDispatcher
 from sb3_knntd.common.checks import check_number
 from sb3_knntd.common.schedules import progress_remaining
 from sb3_knntd.common.transitions import StepCheck
+from sb3_knntd.vec_envs import LeanVecEnv, as_vec_env
 
 SelfOnlineAlgorithm = TypeVar("SelfOnlineAlgorithm", bound="OnlineAlgorithm")
 
@@ -33,6 +38,21 @@ class OnlineAlgorithm(BaseAlgorithm):
     _standing: Any = None
     _acted_on: Any = None
     _step_check: StepCheck | None = None
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # As SB3, with gymnasium.vector's environments and LeanVecEnv in addition.
+        venv = as_vec_env(env)
+        if not isinstance(venv, VecEnv):
+            alone = _patch_env(venv)
+            if monitor_wrapper and not is_wrapped(alone, Monitor):
+                if verbose >= 1:
+                    print("Wrapping the env with a `Monitor` wrapper")
+                alone = Monitor(alone)
+            if verbose >= 1:
+                print("Wrapping the env in a DummyVecEnv.")
+            venv = LeanVecEnv([lambda: alone])
+        return BaseAlgorithm._wrap_env(venv, verbose, monitor_wrapper)
 
     @abstractmethod
     def _act(self) -> np.ndarray:

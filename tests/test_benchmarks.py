@@ -104,6 +104,8 @@ def test_speed_has_a_row_for_each_figure(benchmarks: Any) -> None:
     names = set(benchmarks("speed").BENCHMARKS)
     assert names >= {"bare1", "bare64", "dqn", "points", "huge", "neighbors", "episode", "kd_tree", "hnsw"}
     assert names >= {"predict", "startup", "memory64", "memory32"}
+    assert names >= {"envpool_cart_pole", "envpool_mountain_car", "envpool_ppo", "gymnasium_vector", "lean", "compiled"}
+    assert names >= {"compiled1", "side_by_side", "first_use"}
     # Also one for GPUs, which is skipped with a message if there is none.
     assert "cuda" in names
 

@@ -189,22 +189,22 @@ def test_numba_without_a_cache_folder(tmp_path: pathlib.Path) -> None:
 CACHED = """
 import sys, warnings
 warnings.simplefilter("always")
-from sb3_knntd.kernels.traces import find, rehash
+from sb3_knntd.kernels.traces import insert, rehash
 import numpy as np
 slots = np.full((8, 2), -1, np.int64)
 rehash(np.arange(3), 3, slots)
-found = [int(find(point, slots)) for point in range(4)]
-print(found)
+insert(7, 3, slots)
+print(sorted(slots[slots[:, 0] >= 0].tolist()))
 """
 
 
-def find_with(cache: pathlib.Path) -> str:
-    """What is warned of when a few kernels are compiled with the cache in a folder."""
+def find_with(cache: pathlib.Path, first: str = "") -> str:
+    """What is said on the standard error when a few kernels are compiled with the cache in a folder."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, "-c", CACHED]
+    command = [sys.executable, "-c", first + CACHED]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr[-1500:]
-    assert run.stdout == "[0, 1, 2, -1]\n"
+    assert run.stdout == "[[0, 0], [1, 1], [2, 2], [7, 3]]\n"
     return run.stderr
 
 
@@ -258,6 +258,24 @@ def test_a_full_disk_keeps_no_kernel(tmp_path: pathlib.Path) -> None:
         subprocess.run(["umount", str(disk)], check=True)
     assert warned.count("RuntimeWarning: the kernels are compiled anew") == 1
     assert "No space left" in warned
+
+
+AT_ONCE = """
+from sb3_knntd.kernels import progress
+progress.PATIENCE = 0.0
+import numba
+numba.njit(lambda: 1)()
+"""
+
+
+def test_the_first_use_says_what_is_compiled(tmp_path: pathlib.Path) -> None:
+    said = find_with(tmp_path, AT_ONCE)
+    assert said.count("sb3_knntd compiles for this machine") == 1
+    assert "python -m sb3_knntd.kernels" in said
+    # A line for a kernel, and none for what it consists of or functions of other packages.
+    lines = [line.strip() for line in said.splitlines() if line.endswith(" s")]
+    assert [line.split(" ...")[0] for line in lines] == ["rehash"]
+    assert find_with(tmp_path, AT_ONCE) == "", "nothing is compiled the second time"
 
 
 # ------------------------------------------------------------------------------------------ accelerators

@@ -16,8 +16,9 @@ PACKAGE = Path(sb3_knntd.__file__).parent
 #: From the bottom up. Parts of one line do not import each other.
 LAYERS = (
     ("common",),
-    ("kernels", "envs", "registry", "distributed", "online_algorithm"),
-    ("perception", "q_table"),
+    ("kernels", "envs", "registry", "distributed"),
+    ("vec_envs",),
+    ("online_algorithm", "perception", "q_table"),
     ("actions", "model"),
     ("learners", "filters", "export"),
     ("editing", "datasets"),

@@ -18,6 +18,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_knntd import DeltaFilter
 from sb3_knntd.cli import main
@@ -27,7 +29,7 @@ from sb3_knntd.experiments.reproduce.curves import episode_lengths
 from sb3_knntd.experiments.reproduce.fig4 import SignalRecorder, at_wall, constant_error, ratio_off_wall
 from sb3_knntd.experiments.reproduce.fig6 import success
 from sb3_knntd.experiments.reproduce.fig7 import FullEpisodeRecorder, mean_change, used_share
-from sb3_knntd.experiments.reproduce.settings import load_settings, make_model, total_steps
+from sb3_knntd.experiments.reproduce.settings import compiled, load_settings, make_model, total_steps
 from sb3_knntd.experiments.reproduce.statistics import interval, quantile
 from sb3_knntd.registry import ALGORITHMS
 
@@ -338,19 +340,37 @@ def test_smoothness() -> None:
 
 
 def test_only_an_episode_that_reaches_the_time_limit_is_recorded() -> None:
-    env = FullEpisodeRecorder(gym.make("sb3_knntd/CartPole-v0", n_forces=3, max_episode_steps=6, failure_angle=1))
+    env = gym.make("sb3_knntd/CartPole-v0", n_forces=3, max_episode_steps=6, failure_angle=1)
+    venv = FullEpisodeRecorder(compiled(env))
     for forces, recorded in (([2] * 6, False), ([1, 2, 0, 2, 0, 1], True), ([1] * 6, True)):
-        env.reset()
+        venv.reset()
         for action in forces:
-            _, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
+            if venv.step(np.array([action]))[2][0]:
                 break
-        assert (env.recorded is not None) == recorded
-    assert env.n_episodes == 3
-    states, actions = env.recorded
+        assert (venv.recorded is not None) == recorded
+    assert venv.n_episodes == 3
+    states, actions = venv.recorded
     assert actions == [0.0, 1.0, -1.0, 1.0, -1.0, 0.0]
     assert len(states) == 6
     assert states[0] == pytest.approx([0, 0, 0, 0.01])
+
+
+@pytest.mark.parametrize(
+    ("figure", "variant", "algorithm", "episodes"),
+    [
+        ("fig3", "paper", "knntd", 6),
+        ("fig3", "best", "knntd", 10),
+        ("fig6", "best", "knntd", 20),
+        ("fig6", "paper", "exa", 20),
+    ],
+)
+def test_compiled_environments_do_not_change_the_curves(
+    figure: str, variant: str, algorithm: str, episodes: int
+) -> None:
+    setting = {**load_settings(figure)[variant][algorithm], "episodes": episodes}
+    model = make_model(algorithm, setting, 3, Monitor)
+    model.learn(total_steps(setting), callback=StopTrainingOnMaxEpisodes(episodes))
+    assert episode_lengths(algorithm, setting, 3) == model.env.env_method("get_episode_lengths")[0]
 
 
 @pytest.mark.parametrize(

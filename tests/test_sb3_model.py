@@ -61,18 +61,6 @@ def test_a_wrong_call_names_the_right_one(make: Callable[[], Any], says: list[st
         assert words in message
 
 
-@pytest.mark.parametrize("order", [lambda env: (env,), lambda env: ("KNNPolicy", env)])
-def test_environments_of_gymnasium_vector(order: Callable[[Any], tuple[Any, ...]]) -> None:
-    envs = gym.make_vec("CartPole-v1", num_envs=3, vectorization_mode="sync")
-    for given in (envs, gym.wrappers.vector.RecordEpisodeStatistics(envs)):
-        message = message_of(lambda given=given: KNNTD(*order(given)))  # type: ignore[misc]
-        assert "VecEnv" in message
-        assert "make_vec_env(id, n_envs)" in message
-        assert "mage" not in message
-    assert "make_vec_env" in message_of(lambda: KNNTD("CartPole-v1").set_env(envs))
-    envs.close()
-
-
 def test_user_defined_policies_are_accepted() -> None:
     class Ours(KNNPolicy):
         pass

@@ -14,17 +14,17 @@ def check_environment(algorithm: str, given: Any) -> None:
     """
     :param algorithm: name of the algorithm, for the message
     :param given: value given for the environment
-    :raises ValueError: if it is a class of environments, or an environment of gymnasium.vector
+    :raises ValueError: if it is a class of environments, or a name such as ``"envpool:CartPole-v1"``
     """
     if isinstance(given, type) and issubclass(given, (gym.Env, gym.vector.VectorEnv, VecEnv)):
         raise ValueError(
             f"env must be an environment; got the class {given.__name__}. Make an instance: "
             f"{algorithm}({given.__name__}(...))"
         )
-    if isinstance(given, gym.vector.VectorEnv):
+    if isinstance(given, str) and given.startswith("envpool:"):
         raise ValueError(
-            f"{algorithm} takes SB3's VecEnv, not environments of gymnasium.vector; got {given!r}. Instead of "
-            "gymnasium.make_vec use make_vec_env(id, n_envs) of stable_baselines3.common.env_util"
+            f"{algorithm}({given!r}) would make gymnasium's environment. For EnvPool's, with 64 environments: "
+            f"{algorithm}(EnvPoolVecEnv({given.removeprefix('envpool:')!r}, n_envs=64)), from sb3_knntd.vec_envs"
         )
 
 

@@ -1,16 +1,21 @@
-"""Compile the kernels ahead of the first run: ``python -m sb3_knntd.kernels``."""
+"""Compile all kernels ahead of the first run: ``python -m sb3_knntd.kernels``."""
 
 from __future__ import annotations
 
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
 
+import sb3_knntd.envs  # noqa: F401
 from sb3_knntd import KNNTD, DeltaFilter, ExA, KNNDyna
+from sb3_knntd.vec_envs import CompiledVecEnv
 
 
 def main() -> None:
-    """Learn, predict and filter one step with each type of table and of observations."""
+    """
+    Learn, predict and filter one step with each type of table and of observations, and step the compiled environments.
+    """
     for env_id, dtype in (
         ("MountainCar-v0", th.float64),
         ("MountainCar-v0", th.float32),
@@ -25,6 +30,10 @@ def main() -> None:
     env = DeltaFilter(gym.make("MountainCar-v0"))
     env.reset()
     env.step(0)
+    for name in ("MountainCar", "CartPole", "ContinuousCartPole", "Acrobot"):
+        venv = make_vec_env(f"sb3_knntd/{name}-v0", vec_env_cls=CompiledVecEnv)
+        venv.reset()
+        venv.step(np.array([venv.action_space.sample()]))
 
 
 if __name__ == "__main__":

@@ -11,36 +11,53 @@ try:
     import numba
 
     from sb3_knntd.kernels.cache import keep
+    from sb3_knntd.kernels.progress import report_compilation
 
     AVAILABLE = not getattr(numba.config, "DISABLE_JIT", 0)
     #: why numba cannot be used, empty if it can
     REASON = "" if AVAILABLE else "NUMBA_DISABLE_JIT is set"
+    report_compilation()
 except Exception as error:  # with an unsupported version of NumPy, numba raises other errors than ImportError
     AVAILABLE = False
     REASON = f"{type(error).__name__}: {error}"
 
 
-def jit(function: Function, forceinline: bool = False) -> Function:
+def jit(function: Function) -> Function:
     """
     Compile a function on its first call, without the GIL, and cache the result on disk.
 
     :param function: the function
-    :param forceinline: whether to inline it into compiled functions that call it
     :return: the compiled function, or ``function`` itself without numba
     """
-    if not AVAILABLE:
-        return function
-    compiled = numba.njit(nogil=True, forceinline=forceinline)(function)
-    keep(compiled)
-    return cast(Function, compiled)
+    return _compiled(function)
+
+
+def helper(function: Function) -> Function:
+    """
+    :func:`jit`, for functions that are called from compiled functions only: this takes less time to compile.
+
+    :param function: the function
+    :return: the compiled function, or ``function`` itself without numba
+    """
+    return _compiled(function, no_cpython_wrapper=True)
 
 
 def inlined(function: Function) -> Function:
     """
-    :func:`jit`, inlined into compiled functions that call it. For functions called for each neighbour: passing a dozen
+    :func:`helper`, inlined into the functions that call it. For functions called for each neighbour: passing a dozen
     arrays takes longer than reading from them.
 
     :param function: the function
     :return: the compiled function, or ``function`` itself without numba
     """
-    return jit(function, forceinline=True)
+    return _compiled(function, no_cpython_wrapper=True, forceinline=True)
+
+
+def _compiled(function: Function, **options: Any) -> Function:
+    if not AVAILABLE:
+        return function
+    # Nothing calls these functions from C either.
+    options |= {"nogil": True, "no_cfunc_wrapper": True}
+    compiled = numba.njit(**options)(function)
+    keep(compiled)
+    return cast(Function, compiled)

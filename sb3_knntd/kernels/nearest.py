@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import jit
+from sb3_knntd.kernels.jit import helper, jit
 
 
-@jit
+@helper
 def _next_coordinate(x, axes, below, above, first, end):
     """
     Find the nearer of the next coordinates below and above x; at equal distance, the lower one.
@@ -26,7 +26,7 @@ def _next_coordinate(x, axes, below, above, first, end):
     return (below, down) if down <= up else (above, up)
 
 
-@jit
+@helper
 def _coordinates_up_to(x, axes, first, end):
     """Count the coordinates of a dimension that are at most x."""
     low, high = first, end
@@ -39,7 +39,7 @@ def _coordinates_up_to(x, axes, first, end):
     return low - first
 
 
-@jit
+@helper
 def _left_out(x, axes, first, end, before, numbers_before, filled, sums, numbers, count, blur):
     """
     Whether a sum that was left out of a list could be as good as one of the list. Either it comes before the last one
@@ -84,7 +84,7 @@ def _left_out(x, axes, first, end, before, numbers_before, filled, sums, numbers
     return n_up_to_last > count
 
 
-@jit
+@helper
 def _first_on_lattice(scaled, axes, offsets, count, blur):
     """
     Find the ``count`` points with the smallest squared distances.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import inlined, jit
+from sb3_knntd.kernels.jit import helper, inlined, jit
 from sb3_knntd.kernels.traces import read_row
 
 
@@ -152,7 +152,7 @@ def greedy_action(values, first, end, uniform, random_ties):
     return best
 
 
-@jit
+@helper
 def _softmax(values, temperature, shares):
     best, total = largest(values, 0, len(values)), 0.0
     for action in range(len(values)):
@@ -172,7 +172,9 @@ def _explore(values, uniforms, rate, exploration, random_ties, shares):
         return greedy_action(values, 0, n_actions, uniforms[1], random_ties)
     if exploration == Exploration.SOFTMAX:
         _softmax(values, rate, shares)
-        total, reached, action = shares.sum(), 0.0, 0
+        total, reached, action = 0.0, 0.0, 0
+        for candidate in range(n_actions):
+            total += shares[candidate]
         for candidate in range(n_actions):
             reached += shares[candidate]
             if shares[candidate] > 0.0:
@@ -212,10 +214,11 @@ def _target_value(values, action, rate, target, exploration, shares):
 def _mean_row(indices, probabilities, state, means, row):
     """Q(s, ·) of a state (eq. 8), written into ``means``."""
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
-    means[:] = 0.0
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
+    for action in range(len(means)):
+        means[action] = 0.0
     for i in range(len(indices)):
-        read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
+        read_row(indices[i], values, row_slots, initial_value, entries, members, slots, clock, row)
         for action in range(len(means)):
             means[action] += probabilities[i] * row[action]
 
@@ -237,13 +240,14 @@ def _select_from_each(
     indices, probabilities, uniforms, rate, persistent, state, forbidden, action_indices, mean_action
 ):
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
     factors, action_points, row = state.factors, state.action_points, state.row
     k, n_factors = action_indices.shape
-    mean_action[:] = 0.0
+    for j in range(len(mean_action)):
+        mean_action[j] = 0.0
     value = 0.0
     for i in range(k):
-        read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
+        read_row(indices[i], values, row_slots, initial_value, entries, members, slots, clock, row)
         if state.n_rules > 0:
             mask(row, forbidden)
         for factor in range(n_factors):
@@ -292,7 +296,7 @@ def select(indices, probabilities, uniforms, rate, persistent, state, forbidden,
     raise ValueError("the kernels do not know this combination")
 
 
-@jit
+@helper
 def greedy_and_given_value(indices, probabilities, columns, state, forbidden):
     """
     The values of the greedy action and of a given action in a state. The given one may be forbidden.
@@ -312,11 +316,11 @@ def greedy_and_given_value(indices, probabilities, columns, state, forbidden):
             mask(means, forbidden)
         return largest(means, 0, len(means)), given
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
     n_factors = len(columns)
     greedy, given = 0.0, 0.0
     for i in range(len(indices)):
-        read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
+        read_row(indices[i], values, row_slots, initial_value, entries, members, slots, clock, row)
         for factor in range(n_factors):
             given += probabilities[i] * row[columns[factor]] / n_factors
         if state.n_rules > 0:
@@ -326,7 +330,7 @@ def greedy_and_given_value(indices, probabilities, columns, state, forbidden):
     return greedy, given
 
 
-@jit
+@helper
 def persist(uniforms, rate, lengths, env, selection, persistent):
     """
     Keep the persistent action, or redraw whether to explore and which columns. On average a draw is kept for

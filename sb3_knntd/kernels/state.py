@@ -82,6 +82,7 @@ class WorkArrays(NamedTuple):
     """
     Work space, bounds, and sums for the log.
 
+    :param observation_row: an observation, shape (obs_dim,)
     :param means: shape (n_actions,)
     :param row: shape (n_actions,)
     :param target_values: shape (n_envs,)
@@ -92,6 +93,7 @@ class WorkArrays(NamedTuple):
     :param trace_bound: upper bound of the traces, shape (1,)
     """
 
+    observation_row: np.ndarray
     means: np.ndarray
     row: np.ndarray
     target_values: np.ndarray

@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 
 from sb3_knntd.kernels.experience import record_steps
-from sb3_knntd.kernels.jit import inlined, jit
+from sb3_knntd.kernels.jit import helper, inlined, jit
 from sb3_knntd.kernels.perceive import SearchKind, perceive
 from sb3_knntd.kernels.selection import (
     UNDRAWN,
@@ -48,7 +48,7 @@ CURRENT, NEXT, TERMINAL = 0, 1, 2
 OK, NEED_RANDOM, NEED_CAPACITY, NEED_POINTS, BAD_RATE, NOT_FINITE, DIVERGED = range(7)
 
 
-@jit
+@helper
 def perceive_into(state, observation, which, env):
     """
     Perceive an observation. The neighbours, their probabilities and the forbidden actions are stored in the state.
@@ -65,7 +65,7 @@ def perceive_into(state, observation, which, env):
     return perceive(observation, state, indices, probabilities) > state.squared_spacing
 
 
-@jit
+@helper
 def select_at(state, uniforms, rate, which, env):
     """
     Select an action at a perceived observation. It is stored in the state.
@@ -86,6 +86,22 @@ def select_at(state, uniforms, rate, which, env):
     return select(indices, probabilities, uniforms, rate, persistent, state, forbidden, action_indices, mean_action)
 
 
+@inlined
+def _look_at(observation, state):
+    """The observation as float64, so that what follows is compiled for one type."""
+    seen = state.observation_row
+    for j in range(len(observation)):
+        seen[j] = observation[j]
+    return seen
+
+
+@inlined
+def _undraw(persistent):
+    """Forget the persistent action."""
+    for factor in range(len(persistent)):
+        persistent[factor] = UNDRAWN
+
+
 @jit
 def begin(state, observations, uniforms, rate):
     """
@@ -96,11 +112,13 @@ def begin(state, observations, uniforms, rate):
     :param uniforms: random numbers in [0, 1), shape (n_envs, n_uniforms)
     :param rate: ε or the temperature
     """
-    state.lengths[1:] = 0.0
     for env in range(len(observations)):
-        state.persistent[env, :] = UNDRAWN
-        state.current_observations[env] = observations[env]
-        perceive_into(state, observations[env], CURRENT, env)
+        state.lengths[1 + env] = 0.0
+        _undraw(state.persistent[env])
+        seen = _look_at(observations[env], state)
+        for j in range(len(seen)):
+            state.current_observations[env, j] = seen[j]
+        perceive_into(state, seen, CURRENT, env)
         select_at(state, uniforms[env], rate, CURRENT, env)
 
 
@@ -138,7 +156,7 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
     indices, probabilities = state.indices[CURRENT], state.probabilities[CURRENT]
     chosen = state.action_indices[CURRENT]
     places, corrections, row, factors = state.places, state.corrections, state.row, state.factors
-    entries, slots, clock = state.active_entries, state.active_slots, state.clock
+    entries, members, slots, clock = state.active_entries, state.active_members, state.active_slots, state.clock
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
     n_envs, k, n_factors = chosen.shape
     size, value_sum, change = 0.0, 0.0, 0.0
@@ -150,12 +168,12 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
             if state.combination == Combination.OF_VALUES:
                 column = chosen[env, i, 0]
                 if place >= 0:
-                    value += probability * active_value(entries, place, column, clock)
+                    value += probability * active_value(entries, members, place, column, clock)
                 else:
                     value += probability * stored_value(indices[env, i], column, values, row_slots, initial_value)
             else:
                 if place >= 0:
-                    read_active_row(entries, place, clock, row)
+                    read_active_row(entries, members, place, clock, row)
                 else:
                     read_stored_row(indices[env, i], values, row_slots, initial_value, row)
                 if state.n_rules > 0:
@@ -185,13 +203,13 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
             for factor in range(n_factors):
                 entry = chosen[env, i, factor]
                 if state.accumulating:
-                    set_trace(entries, place, entry, env, entries[place, entry, env] + trace, clock)
+                    set_trace(entries, members, place, entry, env, entries[place, entry, env] + trace, clock)
                     continue
                 if state.reset_other_actions:
                     for other in range(factors[factor], factors[factor + 1]):
                         if other != entry:
-                            set_trace(entries, place, other, env, 0.0, clock)
-                set_trace(entries, place, entry, env, trace, clock)
+                            set_trace(entries, members, place, other, env, 0.0, clock)
+                set_trace(entries, members, place, entry, env, trace, clock)
     for env in range(n_envs):
         clock[1 + env] += corrections[env] * clock[0]
     clock[0] *= state.gamma * trace_decay
@@ -249,74 +267,67 @@ def _are_valid(learning_rate, trace_decay, rate, state):
     return 0.0 < rate < np.inf if state.exploration == Exploration.SOFTMAX else 0.0 <= rate <= 1.0
 
 
-@jit
-def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate):
-    """
-    Perceive the next states, select actions in them, and learn from the steps.
-
-    :param state: see :mod:`sb3_knntd.kernels.state`
-    :param observations: observation units, shape (n_envs, obs_dim)
-    :param rewards: shape (n_envs,)
-    :param ended: whether the episodes have ended, shape (n_envs,), bool
-    :param learning_rate: α
-    :param trace_decay: λ
-    :param rate: ε or the temperature
-    :return: ``OK``; or ``NEED_RANDOM``, ``NEED_CAPACITY``, ``NEED_POINTS`` or ``BAD_RATE``, in which case nothing has
-        been changed; or ``NOT_FINITE`` or ``DIVERGED``, in which case no value has been changed
-    """
-    target_values = state.target_values
-    if state.n_taken[0] == len(state.rows):
-        return NEED_RANDOM
-    if not has_capacity(state):
-        return NEED_CAPACITY
-    if not _are_valid(learning_rate, trace_decay, rate, state):
-        return BAD_RATE
-    uniforms = state.rows[state.n_taken[0]]
-    are_new = False
-    for env in range(len(rewards)):
-        are_finite = np.isfinite(rewards[env])
-        for j in range(observations.shape[1]):
-            are_finite &= np.isfinite(observations[env, j])
-        if not are_finite:
-            # As in the torch learner, the row has been used.
-            state.n_taken[0] += 1
-            return NOT_FINITE
-        are_new |= perceive_into(state, observations[env], NEXT, env)
-        if state.truncated[env]:
-            are_new |= perceive_into(state, state.last_observations[env], TERMINAL, env)
-    if are_new:
-        return NEED_POINTS
-    state.n_taken[0] += 1
-    count_steps(state.lengths, ended)
-    for env in range(len(rewards)):
-        if ended[env]:
-            state.persistent[env, :] = UNDRAWN
-        value = select_at(state, uniforms[env, 0], rate, NEXT, env)
-        if state.truncated[env]:
-            value = select_at(state, uniforms[env, 1], rate, TERMINAL, env)
-        elif ended[env]:
-            value = 0.0
-        target_values[env] = value
-    outcome = update_table(state, target_values, rewards, ended, learning_rate, trace_decay)
-    if outcome == OK:
-        record_steps(state, observations, rewards, ended)
-        _advance(state)
-    return outcome
-
-
 @cache
 def _learn_at(kind):
+    # A function for each type of state, which is found by its address: calling another compiled function here would
+    # compile all of it twice.
     @jit
-    def learn_at(address, observations, rewards, ended, learning_rate, trace_decay, rate):
-        return learn(state_at(address, kind), observations, rewards, ended, learning_rate, trace_decay, rate)
+    def learn(address, observations, rewards, ended, learning_rate, trace_decay, rate):
+        state = state_at(address, kind)
+        target_values = state.target_values
+        if state.n_taken[0] == len(state.rows):
+            return NEED_RANDOM
+        if not has_capacity(state):
+            return NEED_CAPACITY
+        if not _are_valid(learning_rate, trace_decay, rate, state):
+            return BAD_RATE
+        uniforms = state.rows[state.n_taken[0]]
+        are_new = False
+        for env in range(len(rewards)):
+            are_finite = np.isfinite(rewards[env])
+            for j in range(observations.shape[1]):
+                are_finite &= np.isfinite(observations[env, j])
+            if not are_finite:
+                # As in the torch learner, the row has been used.
+                state.n_taken[0] += 1
+                return NOT_FINITE
+            are_new |= perceive_into(state, _look_at(observations[env], state), NEXT, env)
+            if state.truncated[env]:
+                are_new |= perceive_into(state, state.last_observations[env], TERMINAL, env)
+        if are_new:
+            return NEED_POINTS
+        state.n_taken[0] += 1
+        count_steps(state.lengths, ended)
+        for env in range(len(rewards)):
+            if ended[env]:
+                _undraw(state.persistent[env])
+            value = select_at(state, uniforms[env, 0], rate, NEXT, env)
+            if state.truncated[env]:
+                value = select_at(state, uniforms[env, 1], rate, TERMINAL, env)
+            elif ended[env]:
+                value = 0.0
+            target_values[env] = value
+        outcome = update_table(state, target_values, rewards, ended, learning_rate, trace_decay)
+        if outcome == OK:
+            record_steps(state, observations, rewards, ended)
+            _advance(state)
+        return outcome
 
-    return learn_at
+    return learn
 
 
 def learn_with(state):
     """
+    Make the function that perceives the next states, selects actions in them, and learns from the steps:
+    ``learn(observations, rewards, ended, learning_rate, trace_decay, rate)``.
+
+    It takes the observations, observation units, shape (n_envs, obs_dim); the rewards and whether the episodes have
+    ended, shape (n_envs,) each; α; λ; and ε or the temperature. It returns ``OK``; or ``NEED_RANDOM``,
+    ``NEED_CAPACITY`` or ``BAD_RATE``, in which case nothing has been changed; or ``NOT_FINITE`` or ``DIVERGED``, in
+    which case no value has been changed.
+
     :param state: see :mod:`sb3_knntd.kernels.state`; the caller must keep it alive as long as the function is used
-    :return: :func:`learn` with this state, a function of its other arguments
+    :return: the function
     """
     address, kind = address_of(state)
     return partial(_learn_at(kind), address)

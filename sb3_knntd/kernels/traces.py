@@ -9,8 +9,8 @@ changed by (e/c₀)(G - G₀) (Wiering and Schmidhuber, Fast online Q(λ), 1998)
     Q = base + share · Σ_env x G,    share = max_env x / Σ_env x
 
 where share turns the sum of the errors of several environments into a mean. All traces decay at the same rate, so share
-changes only when a trace is set. A step costs O(k · n_actions), independent of λ, the length of the episode and the
-size of the table.
+changes only when a trace is set. The sums are over the environments with a trace at the entry, its *members*. A step
+costs O(k · n_actions), independent of λ, the length of the episode and the size of the table.
 
 A hash maps points to places. It is an array of (point, place), shape (size, 2), int64, filled by linear probing. Its
 size is a power of two; the point -1 marks a free slot.
@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_knntd.kernels.jit import inlined, jit
+from sb3_knntd.kernels.jit import helper, inlined, jit
 
 #: Smaller traces are dropped: their effect is below the precision of a float64.
 LEAST_TRACE = 1e-18
@@ -60,6 +60,8 @@ class TraceArrays(NamedTuple):
 
     :param active_points: shape (capacity,), int64
     :param active_entries: x of each environment, share and base of each entry, shape (capacity, n_actions, n_envs + 2)
+    :param active_members: of several environments, the number of members of each entry, and their indices in ascending
+        order, shape (capacity, n_actions, 1 + n_envs), int32; of one environment, shape (capacity, n_actions, 0)
     :param active_slots: hash from points to places in these arrays
     :param n_active: number of active points, shape (1,), int64
     :param clock: c, and G of each environment, shape (1 + n_envs,)
@@ -67,6 +69,7 @@ class TraceArrays(NamedTuple):
 
     active_points: np.ndarray
     active_entries: np.ndarray
+    active_members: np.ndarray
     active_slots: np.ndarray
     n_active: np.ndarray
     clock: np.ndarray
@@ -101,7 +104,8 @@ def insert(point, place, slots):
 @jit
 def rehash(points, count, slots):
     """Fill a hash with the first ``count`` points, each at its index."""
-    slots[:, 0] = -1
+    for slot in range(len(slots)):
+        slots[slot, 0] = -1
     for place in range(count):
         insert(points[place], place, slots)
 
@@ -113,19 +117,19 @@ def row_of(point, row_slots):
 
 
 @inlined
-def active_value(entries, place, action, clock):
+def active_value(entries, members, place, action, clock):
     """Value of an active entry."""
     n_envs = len(clock) - 1
     if n_envs == 1:
         return entries[place, action, 2] + entries[place, action, 0] * clock[1]
-    gained = 0.0
-    for env in range(n_envs):
-        gained += entries[place, action, env] * clock[1 + env]
-    return entries[place, action, n_envs + 1] + entries[place, action, n_envs] * gained
+    gained, here, those = 0.0, entries[place, action], members[place, action]
+    for i in range(1, 1 + those[0]):
+        gained += here[those[i]] * clock[1 + those[i]]
+    return here[n_envs + 1] + here[n_envs] * gained
 
 
 @inlined
-def read_active_row(entries, place, clock, row):
+def read_active_row(entries, members, place, clock, row):
     """Write the values of an active point into ``row``, shape (n_actions,)."""
     if len(clock) == 2:
         here, gained = entries[place], clock[1]
@@ -133,7 +137,7 @@ def read_active_row(entries, place, clock, row):
             row[action] = here[action, 2] + here[action, 0] * gained
     else:
         for action in range(len(row)):
-            row[action] = active_value(entries, place, action, clock)
+            row[action] = active_value(entries, members, place, action, clock)
 
 
 @inlined
@@ -156,7 +160,7 @@ def read_stored_row(point, values, row_slots, initial_value, row):
 
 
 @inlined
-def read_row(point, values, row_slots, initial_value, entries, slots, clock, row):
+def read_row(point, values, row_slots, initial_value, entries, members, slots, clock, row):
     """
     Write the values of a point into ``row``, shape (n_actions,).
 
@@ -165,7 +169,7 @@ def read_row(point, values, row_slots, initial_value, entries, slots, clock, row
     """
     place = find(point, slots)
     if place >= 0:
-        read_active_row(entries, place, clock, row)
+        read_active_row(entries, members, place, clock, row)
     else:
         read_stored_row(point, values, row_slots, initial_value, row)
 
@@ -178,7 +182,7 @@ def count_visit(point, visits, row_slots):
         visits[row] += 1
 
 
-@jit
+@helper
 def activate(point, table, traces):
     """Make a point active, and add a row to the table if it has none; its place."""
     row = row_of(point, table.row_slots)
@@ -195,6 +199,8 @@ def activate(point, table, traces):
     for action in range(entries.shape[1]):
         for env in range(n_envs):
             entries[place, action, env] = 0.0
+        if n_envs > 1:
+            traces.active_members[place, action, 0] = 0
         entries[place, action, n_envs] = 1.0
         entries[place, action, n_envs + 1] = values[row, action]
     insert(point, place, traces.active_slots)
@@ -202,28 +208,66 @@ def activate(point, table, traces):
 
 
 @inlined
-def set_trace(entries, place, action, env, trace, clock):
+def set_trace(entries, members, place, action, env, trace, clock):
     """Set x of an active entry without changing its value."""
     n_envs = len(clock) - 1
     if n_envs == 1:
         entries[place, action, 2] += (entries[place, action, 0] - trace) * clock[1]
         entries[place, action, 0] = trace
     elif entries[place, action, env] != trace:
-        value = active_value(entries, place, action, clock)
+        value = active_value(entries, members, place, action, clock)
+        _join_or_leave(members[place, action], env, entries[place, action, env] != 0.0, trace != 0.0)
         entries[place, action, env] = trace
-        _reshare(entries, place, action)
+        _reshare(entries, members, place, action)
         entries[place, action, n_envs + 1] = 0.0
-        entries[place, action, n_envs + 1] = value - active_value(entries, place, action, clock)
+        entries[place, action, n_envs + 1] = value - active_value(entries, members, place, action, clock)
+
+
+@helper
+def _join_or_leave(those, env, was_member, is_member):
+    """Insert an environment into the members of an entry, or remove it, in ascending order."""
+    if is_member and not was_member:
+        those[0] += 1
+        place = those[0]
+        while place > 1 and those[place - 1] > env:
+            those[place] = those[place - 1]
+            place -= 1
+        those[place] = env
+    elif was_member and not is_member:
+        place = 1
+        while those[place] != env:
+            place += 1
+        while place < those[0]:
+            those[place] = those[place + 1]
+            place += 1
+        those[0] -= 1
+
+
+@helper
+def _reshare(entries, members, place, action):
+    largest, together, those = 0.0, 0.0, members[place, action]
+    for i in range(1, 1 + those[0]):
+        trace = entries[place, action, those[i]]
+        largest = max(largest, trace)
+        together += trace
+    entries[place, action, entries.shape[2] - 2] = largest / together if together > 0.0 else 1.0
 
 
 @jit
-def _reshare(entries, place, action):
+def find_members(traces):
+    """Find the members of all entries from their traces."""
+    entries, members = traces.active_entries, traces.active_members
     n_envs = entries.shape[2] - 2
-    largest, together = 0.0, 0.0
-    for env in range(n_envs):
-        largest = max(largest, entries[place, action, env])
-        together += entries[place, action, env]
-    entries[place, action, n_envs] = largest / together if together > 0.0 else 1.0
+    if n_envs == 1:
+        return
+    for place in range(traces.n_active[0]):
+        for action in range(entries.shape[1]):
+            those = members[place, action]
+            those[0] = 0
+            for env in range(n_envs):
+                if entries[place, action, env] != 0.0:
+                    those[0] += 1
+                    those[those[0]] = env
 
 
 @jit
@@ -232,10 +276,12 @@ def write_back(table, traces):
     for place in range(traces.n_active[0]):
         row = row_of(traces.active_points[place], table.row_slots)
         for action in range(traces.active_entries.shape[1]):
-            table.values[row, action] = active_value(traces.active_entries, place, action, traces.clock)
+            table.values[row, action] = active_value(
+                traces.active_entries, traces.active_members, place, action, traces.clock
+            )
 
 
-@jit
+@helper
 def largest_size(table, traces):
     """The largest absolute value in the table."""
     values, clock, largest = table.values, traces.clock, 0.0
@@ -245,18 +291,19 @@ def largest_size(table, traces):
             largest = max(largest, abs(values[row, action]))
     for place in range(traces.n_active[0]):
         for action in range(values.shape[1]):
-            largest = max(largest, abs(active_value(traces.active_entries, place, action, clock)))
+            value = active_value(traces.active_entries, traces.active_members, place, action, clock)
+            largest = max(largest, abs(value))
     return largest
 
 
 @jit
 def adopt(table, traces):
     """Set the values of the active points to those in the table. The traces do not change."""
-    entries, clock = traces.active_entries, traces.clock
+    entries, members, clock = traces.active_entries, traces.active_members, traces.clock
     for place in range(traces.n_active[0]):
         row = row_of(traces.active_points[place], table.row_slots)
         for action in range(entries.shape[1]):
-            change = table.values[row, action] - active_value(entries, place, action, clock)
+            change = table.values[row, action] - active_value(entries, members, place, action, clock)
             entries[place, action, entries.shape[2] - 1] += change
 
 
@@ -269,12 +316,13 @@ def overwrite(point, row, table, traces):
         last = traces.n_active[0] - 1
         traces.active_points[place] = traces.active_points[last]
         traces.active_entries[place] = traces.active_entries[last]
+        traces.active_members[place] = traces.active_members[last]
         traces.n_active[0] = last
         rehash(traces.active_points, last, traces.active_slots)
 
 
-@jit
-def _rebase(entries, place, clock):
+@helper
+def _rebase(entries, members, place, clock):
     """Rewrite the bases and the x of an active point for c = 1 and G = 0; whether it still has a trace."""
     n_envs, active = len(clock) - 1, False
     if n_envs == 1:
@@ -286,32 +334,43 @@ def _rebase(entries, place, clock):
             active |= trace >= LEAST_TRACE
         return active
     for action in range(entries.shape[1]):
-        entries[place, action, n_envs + 1] = active_value(entries, place, action, clock)
-        dropped = False
-        for env in range(n_envs):
-            trace = entries[place, action, env] * clock[0]
+        entries[place, action, n_envs + 1] = active_value(entries, members, place, action, clock)
+        those, kept = members[place, action], 0
+        for i in range(1, 1 + those[0]):
+            trace = entries[place, action, those[i]] * clock[0]
             if trace < LEAST_TRACE:
-                dropped = dropped or trace > 0.0
-                trace = 0.0
+                entries[place, action, those[i]] = 0.0
             else:
-                active = True
-            entries[place, action, env] = trace
-        if dropped:
-            _reshare(entries, place, action)
+                entries[place, action, those[i]] = trace
+                kept += 1
+                those[kept] = those[i]
+        active |= kept > 0
+        if kept < those[0]:
+            those[0] = kept
+            _reshare(entries, members, place, action)
     return active
+
+
+@inlined
+def _move(array, source, target):
+    """Copy a row of a three-dimensional array. Slices would take numba seconds more to compile."""
+    for i in range(array.shape[1]):
+        for j in range(array.shape[2]):
+            array[target, i, j] = array[source, i, j]
 
 
 @jit
 def flush(table, traces):
     """Bring all values up to date, drop the points whose traces have decayed, and reset c and G."""
     n_envs = len(traces.clock) - 1
-    points, entries = traces.active_points, traces.active_entries
+    points, entries, members = traces.active_points, traces.active_entries, traces.active_members
     kept = 0
     for place in range(traces.n_active[0]):
-        if _rebase(entries, place, traces.clock):
+        if _rebase(entries, members, place, traces.clock):
             if kept < place:
                 points[kept] = points[place]
-                entries[kept] = entries[place]
+                _move(entries, place, kept)
+                _move(members, place, kept)
             kept += 1
         else:
             row = row_of(points[place], table.row_slots)
@@ -319,11 +378,12 @@ def flush(table, traces):
                 table.values[row, action] = entries[place, action, n_envs + 1]
     traces.n_active[0] = kept
     traces.clock[0] = 1.0
-    traces.clock[1:] = 0.0
+    for env in range(n_envs):
+        traces.clock[1 + env] = 0.0
     rehash(points, kept, traces.active_slots)
 
 
-@jit
+@helper
 def end_episode(env, table, traces):
     """Drop all traces of an environment."""
     clock = traces.clock
@@ -337,7 +397,7 @@ def end_episode(env, table, traces):
     else:
         for place in range(traces.n_active[0]):
             for action in range(traces.active_entries.shape[1]):
-                set_trace(traces.active_entries, place, action, env, 0.0, clock)
+                set_trace(traces.active_entries, traces.active_members, place, action, env, 0.0, clock)
     clock[1 + env] = 0.0
 
 
@@ -345,6 +405,6 @@ def end_episode(env, table, traces):
 def read_rows(points, table, traces, rows):
     """Write the values of points, shape (n,), into ``rows``, shape (n, n_actions), the table's dtype."""
     values, row_slots, initial_value = table.values, table.row_slots, table.initial_value
-    entries, slots, clock = traces.active_entries, traces.active_slots, traces.clock
+    entries, members, slots = traces.active_entries, traces.active_members, traces.active_slots
     for i in range(len(points)):
-        read_row(points[i], values, row_slots, initial_value, entries, slots, clock, rows[i])
+        read_row(points[i], values, row_slots, initial_value, entries, members, slots, traces.clock, rows[i])

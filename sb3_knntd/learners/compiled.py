@@ -73,6 +73,7 @@ class Workplace:
             forbidden=np.zeros((3, n_envs, n_actions), np.bool_),
         )
         self.work = WorkArrays(
+            observation_row=np.zeros(perceiver.bounds.obs_dim),
             means=np.zeros(n_actions),
             row=np.zeros(n_actions),
             target_values=np.zeros(n_envs),
@@ -200,7 +201,9 @@ class CompiledLearner(Learner):
             self._bind()
             if self.perceiver.search_is_outside:
                 self._find(seen, td.CURRENT)
-            td.begin(self._workplace.state, seen, self.stream.next()[:, 0], exploration_rate)
+            # Contiguous, as in learn: otherwise all would be compiled for two types.
+            uniforms = np.ascontiguousarray(self.stream.next()[:, 0])
+            td.begin(self._workplace.state, seen, uniforms, exploration_rate)
         self._workplace.work.trace_bound[0] = 0.0
         self.in_episodes = True
         self.rules_version = self.selector.rules.version

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
-from sb3_knntd.kernels.traces import TableArrays, TraceArrays, flush, rehash
+from sb3_knntd.kernels.traces import TableArrays, TraceArrays, find_members, flush, rehash
 
 #: Initial capacity, active points.
 SMALLEST_CAPACITY = 1024
@@ -37,6 +37,7 @@ class ActiveTraces:
         return TraceArrays(
             active_points=np.empty(capacity, np.int64),
             active_entries=np.empty((capacity, self.n_actions, self.n_envs + 2)),
+            active_members=np.zeros((capacity, self.n_actions, 1 + self.n_envs if self.n_envs > 1 else 0), np.int32),
             active_slots=make_slots(capacity),
             n_active=np.zeros(1, np.int64),
             clock=clock,
@@ -111,6 +112,7 @@ class ActiveTraces:
         arrays.clock[:] = state["pace"].numpy()
         arrays.n_active[0] = n
         rehash(arrays.active_points, n, arrays.active_slots)
+        find_members(arrays)
         return arrays
 
 

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
-from stable_baselines3.common.monitor import Monitor
 
 from sb3_knntd.distributed.jobs import stored_as
 from sb3_knntd.experiments.reproduce.figure import Results, Table
-from sb3_knntd.experiments.reproduce.settings import Setting, make_model, total_steps
+from sb3_knntd.experiments.reproduce.settings import Setting, compiled, make_model, total_steps
 from sb3_knntd.experiments.reproduce.statistics import HIGH, LOW
 from sb3_knntd.plots import LINE_COLOR
 
@@ -28,7 +27,7 @@ def episode_lengths(algorithm: str, setting: Setting, seed: int) -> list[int]:
     :param seed: seed of the model and its environment
     :return: steps of each episode
     """
-    model = make_model(algorithm, setting, seed, Monitor)
+    model = make_model(algorithm, setting, seed, compiled)
     model.learn(total_steps(setting), callback=StopTrainingOnMaxEpisodes(setting["episodes"]))
     env = model.get_env()
     assert env is not None

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.monitor import Monitor
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_knntd.distributed.jobs import stored_as
-from sb3_knntd.envs import CartPoleEnv
 from sb3_knntd.experiments.reproduce.figure import PaperFigure, Results, Table
-from sb3_knntd.experiments.reproduce.settings import Setting, make_model, total_steps
+from sb3_knntd.experiments.reproduce.settings import Setting, compiled, make_model, total_steps
 from sb3_knntd.experiments.reproduce.statistics import HIGH, LOW, interval, quantile, seeds_range, yes_no
 from sb3_knntd.plots import BASELINE_COLOR, LINE_COLOR, new_figure
 from sb3_knntd.registry import ALGORITHMS
@@ -27,39 +28,47 @@ COLORS = {"knntd": BASELINE_COLOR, "exa": LINE_COLOR}
 STATE = ("position", "velocity", "angle", "angular velocity")
 
 
-class FullEpisodeRecorder(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
+class FullEpisodeRecorder(VecEnvWrapper):
     """
     Records the first episode that reaches the time limit.
 
-    :param env: a cart-pole with a time limit
+    :param venv: one cart-pole with a time limit
     """
 
-    def __init__(self, env: gym.Env[np.ndarray, Any]) -> None:
-        super().__init__(env)
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv)
         #: Number of finished episodes.
         self.n_episodes = 0
         #: The states and actions (shares of the largest force) of the recorded episode; None before it.
         self.recorded: tuple[list[list[float]], list[float]] | None = None
+        self._forces = venv.get_attr("forces")[0] if isinstance(venv.action_space, spaces.Discrete) else None
         self._states: list[list[float]] = []
-        self._actions: list[float] = []
+        self._pushes: list[float] = []
 
-    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        observation, info = self.env.reset(**kwargs)
-        self._states, self._actions = [observation.tolist()], []
-        return observation, info
+    def reset(self) -> VecEnvObs:
+        observations = self.venv.reset()
+        self._begin(observations)
+        return observations
 
-    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        core = self.unwrapped
-        push = core.forces[action] if isinstance(core, CartPoleEnv) else np.clip(action, -1.0, 1.0).item()
-        self._actions.append(float(push))
-        if terminated or truncated:
+    def _begin(self, observations: Any) -> None:
+        self._states, self._pushes = [observations[0].tolist()], []
+
+    def step_async(self, actions: np.ndarray) -> None:
+        action = actions[0]
+        push = np.clip(action, -1.0, 1.0).item() if self._forces is None else self._forces[action]
+        self._pushes.append(float(push))
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        if dones[0]:
             self.n_episodes += 1
-            if truncated and not terminated and self.recorded is None:
-                self.recorded = self._states, self._actions
+            if infos[0]["TimeLimit.truncated"] and self.recorded is None:
+                self.recorded = self._states, self._pushes
+            self._begin(observations)
         else:
-            self._states.append(observation.tolist())
-        return observation, reward, terminated, truncated, info
+            self._states.append(observations[0].tolist())  # type: ignore[index]
+        return observations, rewards, dones, infos
 
 
 @stored_as("sb3_knntd.reproduce.fig7.first_full_episode")
@@ -75,9 +84,9 @@ def first_full_episode(algorithm: str, setting: Setting, seed: int) -> dict[str,
     """
     recorders: list[FullEpisodeRecorder] = []
 
-    def wrap(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-        recorders.append(FullEpisodeRecorder(env))
-        return Monitor(recorders[0])
+    def wrap(env: gym.Env[Any, Any]) -> VecEnv:
+        recorders.append(FullEpisodeRecorder(compiled(env)))
+        return recorders[0]
 
     model = make_model(algorithm, setting, seed, wrap)
     (recorder,) = recorders

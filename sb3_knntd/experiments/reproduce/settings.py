@@ -9,11 +9,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_knntd.envs  # noqa: F401
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.registry import ALGORITHMS
+from sb3_knntd.vec_envs import CompiledVecEnv
 
 #: Entries of a setting that are not arguments of the algorithm.
 OF_THE_EXPERIMENT = ("env", "env_kwargs", "episodes", "filter")
@@ -34,14 +37,22 @@ def load_settings(figure: str) -> dict[str, dict[str, Setting]]:
     return settings
 
 
+def compiled(env: gym.Env[Any, Any]) -> CompiledVecEnv:
+    """
+    :param env: one of the environments that can be compiled
+    :return: a VecEnv of it whose steps are compiled, with SB3's Monitor
+    """
+    return CompiledVecEnv([lambda: Monitor(env)])
+
+
 def make_model(
-    algorithm: str, setting: Setting, seed: int, wrap: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
+    algorithm: str, setting: Setting, seed: int, wrap: Callable[[gym.Env[Any, Any]], GymEnv]
 ) -> KNNAlgorithm:
     """
     :param algorithm: name of an algorithm of this package
     :param setting: an entry of ``paper.yml``
     :param seed: seed of the model and its environment
-    :param wrap: wraps the environment
+    :param wrap: wraps the environment, or makes a VecEnv of it
     :return: the model, to be trained for :func:`total_steps`
     """
     arguments = {name: value for name, value in setting.items() if name not in OF_THE_EXPERIMENT}
