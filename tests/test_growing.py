@@ -398,7 +398,7 @@ def test_policies_and_vectors_are_saved_and_loaded(tmp_path: pathlib.Path) -> No
     [
         ("table.values", lambda value: value[:-1]),
         ("table.values", lambda value: value * np.nan),
-        ("table.visited", lambda value: value[:-1]),
+        ("table.visits", lambda value: value[:-1]),
         ("perceiver.points.places", lambda value: value[:, :1]),
         ("perceiver.points.spacing", lambda value: value * 0.0),
         ("perceiver.points.spacing", lambda value: value * np.inf),
