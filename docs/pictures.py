@@ -1,5 +1,5 @@
 """
-Draw the figures of docs/algorithm.md.
+Draw the figures of docs/algorithm.md and docs/knndyna.md.
 
     python docs/pictures.py [FOLDER]
 
@@ -12,14 +12,26 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import matplotlib
 import numpy as np
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_knntd import KNNTD, ExA
-from sb3_knntd.plots import BASELINE_COLOR, LINE_COLOR, NAMES, UNLEARNED_COLOR, ValueGrid, new_figure, value_grid
+from sb3_knntd import KNNTD, ExA, KNNDyna
+from sb3_knntd.plots import (
+    BASELINE_COLOR,
+    LINE_COLOR,
+    NAMES,
+    UNLEARNED_COLOR,
+    ValueGrid,
+    figure_of,
+    new_figure,
+    plot_model_points,
+    plot_rollout,
+    value_grid,
+)
 
 POSITION, VELOCITY = NAMES["MountainCar-v0"].observations
 #: Colour of points that are not neighbours.
@@ -196,11 +208,36 @@ def continuous_action() -> Figure:
     return figure
 
 
+def known_points() -> Figure:
+    """The points of KNNDyna after 400 and 1,500 steps, and the number of actions that are known there."""
+    figure = new_figure(10.5, 4.2)
+    model = KNNDyna("Pendulum-v1", seed=0)
+    for n_steps, axes in zip((400, 1100), figure.subplots(1, 2), strict=True):
+        model.learn(n_steps, reset_num_timesteps=False)
+        plot_model_points(model, dims=(1, 2), axes=axes)
+        axes.set_title(f"{axes.get_title().split(',')[0]} after {model.num_timesteps:,} steps")
+    return figure
+
+
+def rollout() -> Figure:
+    """An episode, and what KNNDyna's model expects of it from its first observation and its actions."""
+    model, env = KNNDyna("Pendulum-v1", seed=0).learn(1_500), gym.make("Pendulum-v1")
+    observations, actions, rewards = [env.reset(seed=3)[0]], [], []
+    for _ in range(60):
+        actions.append(model.predict(observations[-1])[0])
+        observation, reward, *_ = env.step(actions[-1])
+        observations.append(observation)
+        rewards.append(float(reward))
+    return figure_of(plot_rollout(model, np.array(observations), np.array(actions), rewards)[0])
+
+
 PICTURES = {
     "neighbors": neighbors,
     "traces": traces,
     "growth": growth,
     "continuous_action": continuous_action,
+    "known_points": known_points,
+    "rollout": rollout,
 }
 
 
