@@ -56,7 +56,9 @@ def against_copy(repeats: int) -> list[Row]:
     config = UpdateConfig(gamma=0.99, normalized=True, accumulating=False, reset_other_actions=False)
     stream = RandomStream((N_ENVS, 2, selector.n_uniforms))
     assert isinstance(policy.table, DenseTable)
-    learner = TorchLearner(policy.perceiver, policy.table, selector, stream, N_ENVS, config, one_step=True)
+    learner = TorchLearner(
+        policy.perceiver, policy.table, selector, stream, N_ENVS, config, policy.experience, one_step=True
+    )
     rng = np.random.default_rng(0)
     observations = rng.uniform(-1, 1, (N_ENVS, 2)).astype(np.float32)
     learner.begin(observations, 0.1)

@@ -9,7 +9,17 @@ from sb3_knntd.exa import ExA
 from sb3_knntd.filters import DeltaFilter, VecDeltaFilter
 from sb3_knntd.knntd import KNNTD
 from sb3_knntd.perception import Perception
-from sb3_knntd.policies import ExAPolicy, KNNPolicy
+from sb3_knntd.policies import ExAPolicy, KNNPolicy, load_policy
 
-__all__ = ["KNNTD", "DeltaFilter", "ExA", "ExAPolicy", "KNNDyna", "KNNPolicy", "Perception", "VecDeltaFilter"]
+__all__ = [
+    "KNNTD",
+    "DeltaFilter",
+    "ExA",
+    "ExAPolicy",
+    "KNNDyna",
+    "KNNPolicy",
+    "Perception",
+    "VecDeltaFilter",
+    "load_policy",
+]
 __version__ = version("sb3-knntd")

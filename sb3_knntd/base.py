@@ -33,20 +33,21 @@ from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.schedules import check_rate, constant_of, make_schedule
 from sb3_knntd.common.transitions import check_transition
+from sb3_knntd.insight import Inspectable
 from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.learners import CompiledLearner, Learner, Rates, TorchLearner
+from sb3_knntd.offline import OfflineLearning
 from sb3_knntd.perception.bounds import steps_to_measure
 from sb3_knntd.policies import KNNPolicy
 from sb3_knntd.q_table import DenseTable
-from sb3_knntd.saving import SavedAlgorithm
 
 NONE_TRUNCATED: dict[int, np.ndarray] = {}
 #: The largest seed of NumPy's global generator.
 LARGEST_SEED = 2**32 - 1
 
 
-class KNNAlgorithm(SavedAlgorithm):
+class KNNAlgorithm(Inspectable, OfflineLearning):
     """
     Base class of the algorithms of this package: parameters, policy, learner, and measuring of unbounded dimensions.
 
@@ -277,11 +278,20 @@ class KNNAlgorithm(SavedAlgorithm):
     def _make_learner(self) -> Learner:
         policy, config = self.policy, self._update_config()
         if policy.is_compiled:
-            return CompiledLearner(policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config)
+            return CompiledLearner(
+                policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config, policy.experience
+            )
         assert isinstance(policy.table, DenseTable)
         one_step = self.trace_decay == 0.0
         return TorchLearner(
-            policy.perceiver, policy.table, policy.selector, self._stream, self.n_envs, config, one_step=one_step
+            policy.perceiver,
+            policy.table,
+            policy.selector,
+            self._stream,
+            self.n_envs,
+            config,
+            policy.experience,
+            one_step=one_step,
         )
 
     def _update_config(self) -> UpdateConfig:
@@ -416,7 +426,8 @@ class KNNAlgorithm(SavedAlgorithm):
         if self._measuring:
             return self.policy.fit_actions(self._random_actions())
         learner = self.learner
-        if not learner.in_episodes:
+        # Where the rules have changed, the next action may be forbidden.
+        if not learner.in_episodes or learner.rules_version != learner.selector.rules.version:
             assert isinstance(self._last_obs, np.ndarray)
             if self.policy.grows and not self.policy.perceiver.sees(self._last_obs):
                 self._lay_anew(self._last_obs)
@@ -470,8 +481,8 @@ class KNNAlgorithm(SavedAlgorithm):
         return self._n_measured < steps_to_measure(self.n_envs) and self.policy.perceiver.bounds.is_open
 
     def _random_actions(self) -> np.ndarray:
-        uniforms = self._stream.next()[:, 0]
-        return (uniforms[:, 0] * self.policy.table.n_actions).astype(np.int64)
+        uniforms = self._stream.next()[:, 0, :1]
+        return self.policy.selector.random_columns(uniforms, self._last_obs)[:, 0]  # type: ignore[arg-type]
 
     def _measure(self, observations: np.ndarray, rewards: np.ndarray, truncated: dict[int, np.ndarray]) -> None:
         check_transition(observations, rewards)

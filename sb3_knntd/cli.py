@@ -8,10 +8,12 @@ from sb3_knntd.common.command_line import run_commands
 from sb3_knntd.experiments.compare.parser import add_compare
 from sb3_knntd.experiments.demo import add_demo
 from sb3_knntd.experiments.reproduce.parser import add_reproduce
+from sb3_knntd.export.parser import add_export
+from sb3_knntd.insight.command import add_inspect
 from sb3_knntd.zoo.parser import add_zoo
 
 #: The commands, in the order of the help.
-COMMANDS = (add_demo, add_reproduce, add_compare, add_zoo)
+COMMANDS = (add_demo, add_inspect, add_export, add_reproduce, add_compare, add_zoo)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

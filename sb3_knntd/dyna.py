@@ -18,9 +18,11 @@ from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.common.checks import check_integer, check_number
 from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.common.schedules import make_schedule
+from sb3_knntd.datasets import record
 from sb3_knntd.dyna_policies import BANDWIDTH, DynaBoxPolicy, DynaPolicy, policy_for
+from sb3_knntd.editing import actions_of
 from sb3_knntd.kernels.selection import Target
-from sb3_knntd.learners import Learner
+from sb3_knntd.learners import Learner, Transitions
 from sb3_knntd.model import Prediction, TransitionBuffer
 from sb3_knntd.model.rewards import compiled_reward
 from sb3_knntd.perception.growing import Growth
@@ -83,6 +85,7 @@ class KNNDyna(KNNAlgorithm):
     """
 
     learner: DynaLearner
+    _refinable: ClassVar[tuple[str, ...]] = ()
     buffer_size: Any = FixedHyperparameter()
     action_points: Any = FixedHyperparameter()
     reward_function: Any = FixedHyperparameter()
@@ -201,8 +204,10 @@ class KNNDyna(KNNAlgorithm):
 
     def _make_selector(self) -> ActionSelector:
         if isinstance(self.action_space, spaces.Box):
-            return PeakSelector(self.policy.columns, random_ties=True)
-        return MeanValueSelector(self.policy.columns, Target.Q_LEARNING, EpsilonGreedy(), random_ties=True)
+            return PeakSelector(self.policy.columns, random_ties=True, rules=self.policy.rules)
+        return MeanValueSelector(
+            self.policy.columns, Target.Q_LEARNING, EpsilonGreedy(), random_ties=True, rules=self.policy.rules
+        )
 
     def _make_exploration_schedule(self) -> Schedule:
         return make_schedule(0.0)
@@ -291,6 +296,53 @@ class KNNDyna(KNNAlgorithm):
         columns = batch if batch is not None else self.policy.columns_of(given[None])[:, 0]
         scaled = self.learner.scaled_actions(columns)[0]
         return self.learner.planner.predict(obs.reshape(-1).astype(np.float64), scaled)
+
+    # ---------------------------------------------------------- learning offline
+
+    def imitate(self: SelfKNNDyna, controller: Any, n_steps: int = 5000, margin: float | None = None) -> SelfKNNDyna:
+        """
+        Start from a controller: it is run in the environment, and the model is learned from these steps. The policy is
+        planned with the model, so it is no copy of the controller.
+
+        :param controller: a function from an observation to an action, an SB3 model or policy, or another object whose
+            ``predict`` returns (action, state)
+        :param n_steps: number of steps to run it, over all environments
+        :param margin: has no effect: the values are planned
+        :return: the model
+        :raises ValueError: if an argument is invalid, or the controller returns no action of the action space
+        """
+        act, n_steps = actions_of(controller), check_integer("n_steps", n_steps, 1)
+        if self.env is None:
+            raise ValueError("there is no environment to run the controller in: call set_env(env) first")
+        # The environments are no longer where they were.
+        self._last_obs = None
+        self._abandon_episodes()
+        transitions, mean_return = record(self.env, act, n_steps)
+        self._learn_offline(transitions, 1)
+        if self.verbose >= 1:
+            print(f"The controller's mean return over {n_steps} steps: {mean_return:.4g}")
+        return self
+
+    def refine(self: SelfKNNDyna, points: Any = None, bounds: Any = None) -> SelfKNNDyna:
+        """
+        Raises an error: the points of KNNDyna grow by themselves.
+
+        :param points: has no effect
+        :param bounds: has no effect
+        :raises ValueError: always
+        """
+        raise ValueError("the points of KNNDyna grow: make a new model with a smaller spacing, and learn_from its data")
+
+    def _learn_offline(self, transitions: Transitions, passes: int) -> None:
+        if isinstance(self.action_space, spaces.Discrete):
+            transitions = transitions._replace(actions=transitions.actions - int(self.action_space.start))
+        else:
+            transitions = transitions._replace(actions=transitions.actions.reshape(len(transitions.rewards), -1))
+        self.learner.planner.settings = self._plan_settings()
+        self.learner.update(transitions, self.lr_schedule(1.0), self.trace_schedule(1.0))
+        # The data are in the model: further passes plan.
+        for _ in range(passes - 1):
+            self.learner.plan(len(transitions.rewards))
 
     # ---------------------------------------------------------------- logging
 

@@ -18,7 +18,7 @@ from sb3_knntd.policies import ExAPolicy, KNNPolicy
 BANDWIDTH = 0.7
 
 
-class _SpacedPolicy(KNNPolicy):
+class SpacedPolicy(KNNPolicy):
     """A policy whose bandwidth follows the spacing of points that grow."""
 
     @property
@@ -40,13 +40,13 @@ class _SpacedPolicy(KNNPolicy):
         return answer
 
 
-class DynaPolicy(_SpacedPolicy):
+class DynaPolicy(SpacedPolicy):
     """
     A table of action values at points that grow. The parameters are those of :class:`~sb3_knntd.KNNPolicy`.
     """
 
 
-class DynaBoxPolicy(_SpacedPolicy, ExAPolicy):
+class DynaBoxPolicy(SpacedPolicy, ExAPolicy):
     """
     A table of the values of action points. The values of the neighbours are averaged, and the action is the peak of a
     parabola through the best action point and those next to it, see :class:`~sb3_knntd.actions.peak.PeakSelector`.
@@ -54,7 +54,7 @@ class DynaBoxPolicy(_SpacedPolicy, ExAPolicy):
     """
 
     def _greedy_selector(self) -> ActionSelector:
-        return PeakSelector(self.columns, random_ties=False)
+        return PeakSelector(self.columns, random_ties=False, rules=self.rules)
 
     def predict(
         self,

@@ -164,6 +164,7 @@ class ExA(KNNAlgorithm):
             persistence_share,
             self.policy.n_neighbors,
             self.tie_break == "random",
+            self.policy.rules,
         )
 
     def _persistence(self) -> tuple[float, float]:
@@ -182,7 +183,8 @@ class ExA(KNNAlgorithm):
 
     def _random_actions(self) -> np.ndarray:
         selector = self.policy.selector
-        columns = selector.random_columns(self._stream.next()[:, 0, 2 : 2 + selector.n_factors])
+        uniforms = self._stream.next()[:, 0, 2 : 2 + selector.n_factors]
+        columns = selector.random_columns(uniforms, self._last_obs)  # type: ignore[arg-type]
         actions: np.ndarray = self.policy.columns.points[columns].sum(axis=1)
         return actions
 

@@ -55,10 +55,12 @@ class KNNTD(KNNAlgorithm):
         until there is room for more, and points nearer than that to another are dropped
     :param bounds: the range mapped to [-1, 1]: (low, high), arrays (obs_dim,) in observation units; ``None`` takes the
         bounds of the space, and measures the range of unbounded dimensions in a random phase at the start of
-        :meth:`learn`; ``"adaptive"`` measures the range of every dimension, and widens it whenever an observation lies
-        outside: the values are then carried over to the new points of the lattice, and traces are dropped. With points
-        that grow, the range of these dimensions is the one visited so far, from the first step on: when it has grown
-        by more than a tenth, all is scaled anew, and points that have come too near to another are dropped
+        :meth:`learn`, as that of dimensions with a bound that is given as NaN or infinite; a dict such as
+        ``{1: (-3, 3)}`` gives the bounds of some dimensions; ``"adaptive"`` measures the range of every dimension, and
+        widens it whenever an observation lies outside: the values are then carried over to the new points of the
+        lattice, and traces are dropped. With points that grow, the range of these dimensions is the one visited so
+        far, from the first step on: when it has grown by more than a tenth, all is scaled anew, and points that have
+        come too near to another are dropped
     :param weights: ``"inverse_quadratic"``: 1 / (1 + d²/h²), eq. 5; ``"gaussian"``: exp(-d²/2h²); or a function from
         squared distances (batch, k), scaled units, to weights (batch, k), both torch tensors
     :param bandwidth: h of the weights, >= 1e-100, scaled units (the range of each dimension has width 2)
@@ -173,7 +175,9 @@ class KNNTD(KNNAlgorithm):
         target = check_member("target", self.target, Target)
         check_word("exploration", self.exploration, EXPLORATIONS)
         exploration = EXPLORATIONS[self.exploration]()
-        return MeanValueSelector(self.policy.columns, target, exploration, self.tie_break == "random")
+        return MeanValueSelector(
+            self.policy.columns, target, exploration, self.tie_break == "random", self.policy.rules
+        )
 
     def _make_exploration_schedule(self) -> Schedule:
         check_word("exploration", self.exploration, EXPLORATIONS)

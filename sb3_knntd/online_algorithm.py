@@ -55,6 +55,9 @@ class OnlineAlgorithm(BaseAlgorithm):
     def _abandon_episodes(self) -> None:
         """Forget the current episodes and selected actions: the environments have changed state or will be reset."""
 
+    def _conclude(self) -> None:
+        """Called at the end of :meth:`learn`."""
+
     def _checks_steps(self) -> bool:
         """Whether to check that observations are arrays of the shape of the observation space."""
         return True
@@ -98,6 +101,7 @@ class OnlineAlgorithm(BaseAlgorithm):
         dispatcher.flush(self.num_timesteps)
         self.policy.set_training_mode(False)
         callback.on_training_end()
+        self._conclude()
         return self
 
     def _setup_learn(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
 
 import cloudpickle
 import numpy as np
@@ -12,19 +13,26 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_knntd.actions.columns import ActionColumns, discrete_columns, make_action_columns
 from sb3_knntd.actions.exploration import EpsilonGreedy
+from sb3_knntd.actions.rules import Rules
 from sb3_knntd.actions.selection import ActionSelector, MeanActionSelector, MeanValueSelector, mean_rows
-from sb3_knntd.common.checks import check_flag, check_number, check_size, check_word, shown
+from sb3_knntd.common.checks import check_flag, check_number, check_path, check_size, check_word, shown
 from sb3_knntd.common.interrupts import interrupts_held
+from sb3_knntd.common.plain import loaded_class
 from sb3_knntd.common.tracing import is_traced
+from sb3_knntd.editing import TableEditing
+from sb3_knntd.export import FrozenPolicy, export_policy
+from sb3_knntd.export.shared import read_safetensors
 from sb3_knntd.kernels import jit
 from sb3_knntd.kernels.selection import Exploration, Target
 from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.compiled import GreedyReader
 from sb3_knntd.learners.growth import grow, lay_anew
 from sb3_knntd.perception import (
+    Experience,
     GrowingPoints,
     Growth,
     Lattice,
@@ -42,7 +50,7 @@ from sb3_knntd.q_table import DenseTable, GrowingTable, HashedTable, QTable
 DENSE_TABLE_BYTES = 2**28
 
 
-class KNNPolicy(BasePolicy):
+class KNNPolicy(TableEditing, BasePolicy):
     """
     A table of action values at points of the observation space, read as a weighted mean over the k nearest points.
 
@@ -54,7 +62,8 @@ class KNNPolicy(BasePolicy):
         units
     :param spacing: of points that grow, see :class:`~sb3_knntd.KNNTD`
     :param max_points: of points that grow, see :class:`~sb3_knntd.KNNTD`
-    :param bounds: ``None``, ``"adaptive"`` or (low, high), arrays of shape (obs_dim,) in observation units
+    :param bounds: ``None``, ``"adaptive"``, (low, high), arrays of shape (obs_dim,) in observation units, or a dict of
+        dimensions and their (low, high)
     :param weights: ``"inverse_quadratic"``, ``"gaussian"`` or a function from squared distances (batch, k) to
         weights (batch, k)
     :param bandwidth: h of the weights, scaled units
@@ -114,6 +123,8 @@ class KNNPolicy(BasePolicy):
         }
         self.perceiver = make_perceiver(perception, observation_space, bounds_from_space=bounds_from_space)
         self.n_neighbors = self.perceiver.search.n_neighbors
+        #: statistics of the steps that were learned from
+        self.experience = Experience(self.perceiver.bounds.obs_dim)
         self._compilable = compiled and jit.AVAILABLE and isinstance(self.perceiver.weights, KernelWeights)
         if compiled and not jit.AVAILABLE:
             warnings.warn(
@@ -126,6 +137,8 @@ class KNNPolicy(BasePolicy):
             self.table: QTable = self._make_growing_table(table, n_actions, initial_value, dtype)
         else:
             self.table = self._make_table(table, self.perceiver.points, n_actions, initial_value, dtype)
+        #: where actions are forbidden, see :meth:`forbid`
+        self.rules = Rules(self.perceiver.bounds.obs_dim, n_actions)
         #: selects actions; the algorithm sets one that explores
         self.selector = self._greedy_selector()
         self._reader: GreedyReader | None = None
@@ -142,7 +155,7 @@ class KNNPolicy(BasePolicy):
         return discrete_columns(int(self.action_space.n))
 
     def _greedy_selector(self) -> ActionSelector:
-        return MeanValueSelector(self.columns, Target.SARSA, EpsilonGreedy(), random_ties=False)
+        return MeanValueSelector(self.columns, Target.SARSA, EpsilonGreedy(), random_ties=False, rules=self.rules)
 
     def _make_table(self, table: str, places: Points, n_actions: int, initial_value: float, dtype: th.dtype) -> QTable:
         check_word("policy_kwargs: table", table, ["auto", "dense", "hashed"])
@@ -214,6 +227,14 @@ class KNNPolicy(BasePolicy):
         ``set_parameters``.
         """
         return self.table.entries()
+
+    @property
+    def visits(self) -> th.Tensor:
+        """
+        The number of learning steps that have updated each of :attr:`points` as one of the k nearest, up to 2³⁰, shape
+        (n_points,), int32. Updates along the traces are not counted.
+        """
+        return self.table.counts()
 
     def widen(self, observations: th.Tensor) -> None:
         """
@@ -290,9 +311,10 @@ class KNNPolicy(BasePolicy):
     def q_values(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         """
         :param observation: one observation, or a batch, observation units
-        :return: Q(s, ·) = Σ p(i) Q(i, ·) (eq. 8), shape (batch, n_actions)
+        :return: Q(s, ·) = Σ p(i) Q(i, ·) (eq. 8), also of forbidden actions, shape (batch, n_actions)
         """
-        return mean_rows(*self.perceived_rows(observation))
+        perception = self.perceive(observation)
+        return mean_rows(self.table.rows(perception.indices), perception.probabilities.to(self.table.values.dtype))
 
     def state_values(self, observation: np.ndarray | th.Tensor) -> th.Tensor:
         """
@@ -305,8 +327,8 @@ class KNNPolicy(BasePolicy):
     def perceived_rows(self, observation: np.ndarray | th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param observation: one observation, or a batch, observation units
-        :return: the rows of the table at the nearest points, shape (batch, k, n_actions), and the probabilities of the
-            points, shape (batch, k)
+        :return: the rows of the table at the nearest points, with -inf at forbidden actions, shape
+            (batch, k, n_actions), and the probabilities of the points, shape (batch, k)
         """
         return self._rows(self._to_tensor(observation))
 
@@ -391,12 +413,14 @@ class KNNPolicy(BasePolicy):
 
     def _rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         perception = self._perceive(observations)
-        return self.table.rows(perception.indices), perception.probabilities.to(self.table.values.dtype)
+        probabilities = perception.probabilities.to(self.table.values.dtype)
+        return self.rules.mask(self.table.rows(perception.indices), probabilities, observations), probabilities
 
     def _exact_rows(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Like :meth:`_rows` in float64 for every dtype of the table, as in the kernels."""
         perception = self._perceive(observations)
-        return self.table.rows(perception.indices).double(), perception.probabilities
+        rows = self.table.rows(perception.indices).double()
+        return self.rules.mask(rows, perception.probabilities, observations), perception.probabilities
 
     def _apply(self, fn: Callable[[th.Tensor], th.Tensor], recurse: bool = True) -> KNNPolicy:
         super()._apply(fn, recurse)
@@ -423,6 +447,32 @@ class KNNPolicy(BasePolicy):
         """
         content = {"state_dict": self.state_dict(), "data": self._get_constructor_parameters()}
         th.save(content, path, pickle_module=cloudpickle)
+
+    def frozen(self) -> FrozenPolicy:
+        """
+        :return: what the policy does now, as plain numbers
+        """
+        selector = self._greedy_selector()
+        return FrozenPolicy.of(self.perceiver, self.table, selector, self.observation_space, self.action_space)
+
+    def export(
+        self, path: str | Path, format: str, *, test_vectors: str | Path | None = None, **options: Any
+    ) -> list[Path]:
+        """
+        Write the greedy policy in a form that needs neither this package nor, but for torch's own formats, Python.
+
+        :param path: file to write, with the format's suffix added if it has none
+        :param format: ``"c"``, ``"onnx"``, ``"torchscript"``, ``"torch_export"``, ``"safetensors"``, ``"csv"`` or
+            ``"npz"``, see :data:`sb3_knntd.export.FORMATS`
+        :param test_vectors: a further file, CSV, for random observations with their actions and values, to test the
+            exported policy with
+        :param options: of the format. ``"c"`` takes ``precision``, ``"double"`` or ``"float"``, and ``rows``, the rows
+            of the table to store: ``"changed"``, those that differ from the initial value, ``"all"``, or ``"auto"``
+        :return: the files written
+        :raises ValueError: if the format, or an option, is unknown, or the format cannot hold this policy
+        :raises ImportError: if the format needs a library that is not installed
+        """
+        return export_policy(self, path, format, test_vectors=test_vectors, **options)
 
     def parameters_to_vector(self) -> np.ndarray:
         """
@@ -455,6 +505,17 @@ class KNNPolicy(BasePolicy):
             "action_space": self.action_space,
             **self._arguments,
         }
+
+
+class TableModel(Protocol):
+    """A model whose policy is a table: what pictures and explanations are made from."""
+
+    policy: KNNPolicy
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+
+    def get_env(self) -> VecEnv | None:
+        """The environment; ``None`` if there is none."""
 
 
 class ExAPolicy(KNNPolicy):
@@ -523,11 +584,15 @@ class ExAPolicy(KNNPolicy):
         return self.selector.columns_of(np.asarray(actions).reshape(len(actions), -1))
 
     def _greedy_selector(self) -> ActionSelector:
-        return MeanActionSelector(self.columns, Exploration.SHARED, 1.0, 0.0, self.n_neighbors, random_ties=False)
+        return MeanActionSelector(
+            self.columns, Exploration.SHARED, 1.0, 0.0, self.n_neighbors, random_ties=False, rules=self.rules
+        )
 
     def _recommended(self, action_indices: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
         points = self.columns.points[action_indices].sum(axis=2)
-        return self.fit_actions((probabilities[..., None] * points).sum(axis=1))
+        # Summed one after the other, as in the kernels: a mean that is exactly between two whole actions can fall on
+        # either side otherwise.
+        return self.fit_actions((probabilities[..., None] * points).cumsum(axis=1)[:, -1])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
@@ -539,3 +604,29 @@ class ExAPolicy(KNNPolicy):
         low, high = (bound.to(actions.device) for bound in self._action_bounds)
         fitting = actions.to(low.dtype).reshape(-1, *low.shape)
         return th.minimum(th.maximum(fitting, low), high) if self._can_exceed else fitting
+
+
+def load_policy(path: str | Path, device: th.device | str = "cpu") -> KNNPolicy:
+    """
+    Read a policy that was exported as ``"safetensors"``. Nothing from the file is executed or imported, so it may come
+    from anyone.
+
+    :param path: the file
+    :param device: device of the perception and the table
+    :return: the policy, to predict with and to look into. To learn on from it, make a model with the same points, and
+        call ``model.policy.load_state_dict(policy.state_dict())``
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if it is damaged, or holds no policy of this package
+    :raises ImportError: if safetensors is not installed
+    """
+    name, arguments, tensors = read_safetensors(check_path("path", path))
+    kind = loaded_class(name, KNNPolicy)
+    if any(callable(value) for value in arguments.values()):
+        raise ValueError(f"{path}: an argument of the policy is a class, which nothing but a number or a word can be")
+    try:
+        policy: KNNPolicy = kind(**arguments)
+        policy.load_state_dict(tensors)
+    except (TypeError, AssertionError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{path} holds no valid policy: {error}") from error
+    policy.set_training_mode(False)
+    return policy.to(device)

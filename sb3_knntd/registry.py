@@ -11,6 +11,8 @@ from typing import Any
 
 from gymnasium import spaces
 
+from sb3_knntd.common.files import read_description
+
 
 class Role(Enum):
     """The role of an algorithm in this package."""
@@ -109,6 +111,20 @@ def for_actions(action_space: spaces.Space[Any]) -> Algorithm:
     """
     own = list(with_role(Role.OWN).values())
     return next((algorithm for algorithm in own if isinstance(action_space, algorithm.action_space)), own[0])
+
+
+def for_saved(path: str | Path) -> Algorithm:
+    """
+    :param path: a saved model, with or without ``.zip``
+    :return: the algorithm of this package that it was saved by; nothing is unpickled to find out
+    :raises FileNotFoundError: if there is no such file
+    :raises ValueError: if it is damaged, or a model of another algorithm
+    """
+    own = {algorithm.entry_point.partition(":")[2]: algorithm for algorithm in with_role(Role.OWN).values()}
+    name = read_description(path).get("algorithm")
+    if name not in own:
+        raise ValueError(f"{path} must hold a model of {', '.join(own)}; it holds one of {name or 'another algorithm'}")
+    return own[name]
 
 
 def _load(entry_point: str) -> Any:

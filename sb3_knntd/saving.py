@@ -33,6 +33,8 @@ class SavedAlgorithm(OnlineAlgorithm):
     learner: Learner
     #: name of the algorithm in saved files, the same for all subclasses, which can load each other's files
     _algorithm: ClassVar[str]
+    #: arguments of the constructor that :meth:`refine` can change after loading
+    _refinable: ClassVar[tuple[str, ...]] = ()
     _stream: RandomStream
     _prediction_stream: RandomStream
 
@@ -106,7 +108,8 @@ class SavedAlgorithm(OnlineAlgorithm):
 
         SB3's format contains pickled objects, and unpickling executes code from the file, so load only files from
         sources that you trust. With ``trusted=False`` nothing is unpickled: spaces, SB3's schedules, arrays and numbers
-        are read from the data that :meth:`save` adds to the file.
+        are read from the data that :meth:`save` adds to the file. To share what was learned,
+        ``model.policy.export(path, "safetensors")`` writes a file without pickled objects.
 
         :param path: file, or file-like object
         :param env: environment to continue with, ``None`` to predict only. The number of environments may differ from
@@ -117,7 +120,8 @@ class SavedAlgorithm(OnlineAlgorithm):
         :param force_reset: whether ``learn`` starts new episodes; with ``False`` it continues the saved episodes, for
             an environment that is still in the saved state
         :param trusted: whether to unpickle objects; use ``False`` for files from others
-        :param kwargs: attributes to change; with ``seed``, new sequences of random numbers are started
+        :param kwargs: attributes to change; with ``seed``, new sequences of random numbers are started; with ``points``
+            or ``bounds``, the values are carried over to the new points, see ``refine``
         :return: the model
         :raises ValueError: if the file is damaged, the algorithm or the spaces of ``env`` differ, or, with
             ``trusted=False``, the file holds functions or other objects only as pickles
@@ -129,6 +133,7 @@ class SavedAlgorithm(OnlineAlgorithm):
                 f"{path} holds a model of {saved.get('algorithm', 'another algorithm')}, not of {cls._algorithm}: "
                 "load it with its own class"
             )
+        refined = {name: kwargs.pop(name) for name in cls._refinable if name in kwargs}
         if not trusted:
             custom_objects = objects_for(path, saved, custom_objects or {}) | (custom_objects or {})
         try:
@@ -153,4 +158,17 @@ class SavedAlgorithm(OnlineAlgorithm):
         if kwargs.get("seed") is None:
             for stream, state in zip((model._stream, model._prediction_stream), model._stream_states, strict=True):
                 stream.set_state(state)
+        if refined:
+            model.refine(**refined)
         return model
+
+    def refine(self: SelfSavedAlgorithm, points: Any = None, bounds: Any = None) -> SelfSavedAlgorithm:
+        """
+        Lay the points anew, and carry the values over.
+
+        :param points: as in the constructor; ``None`` leaves them
+        :param bounds: as in the constructor; ``None`` leaves them
+        :return: the model
+        :raises NotImplementedError: if the algorithm has no such points
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot be refined")

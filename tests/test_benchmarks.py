@@ -6,6 +6,7 @@ import importlib
 import json
 import math
 import pathlib
+import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -69,6 +70,23 @@ def test_ray_vec_env_prints_and_stores_its_table(tmp_path: pathlib.Path) -> None
     for row, printed in zip(rows, done.stdout.splitlines()[2:4], strict=True):
         assert min(row["subproc"], row["ray"]) > 1e3 * row["seconds"]
         assert printed == f"| {1e3 * row['seconds']:g} | {row['subproc']:.2f} | {row['ray']:.2f} |"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_export_prints_and_stores_its_table(tmp_path: pathlib.Path) -> None:
+    file = tmp_path / "export.json"
+    command = [sys.executable, "-m", "benchmarks.export", "--repeats", "1", "--json", str(file)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    rows = json.loads(file.read_text())["rows"]
+    # The page has the lines of this table.
+    page = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    for row, printed in zip(rows, done.stdout.splitlines()[2:], strict=False):
+        assert printed.startswith(f"| {row['policy']} | {row['options']} | {row['nanoseconds']:,.0f} | ")
+        assert f"| {row['policy']} | {row['options']} | " in page
+        assert row["size"] > 0
+        assert 0.0 < row["nanoseconds"] < row["predict"]
 
 
 def test_speed_refuses_what_it_does_not_know(

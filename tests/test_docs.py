@@ -151,7 +151,7 @@ def test_docstrings_of_environments_run_and_have_a_page(environment: str) -> Non
 @pytest.mark.parametrize("module", ["sb3_knntd", "sb3_knntd.callbacks"])
 def test_reference_has_every_public_name(module: str) -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
-    described = set(re.findall(r"\.\. autoclass:: (?:[\w.]+\.)?(\w+)$", text, re.MULTILINE))
+    described = set(re.findall(r"\.\. auto(?:class|function):: (?:[\w.]+\.)?(\w+)$", text, re.MULTILINE))
     assert set(importlib.import_module(module).__all__) <= described
 
 

@@ -48,6 +48,21 @@ def test_tank_level(run: Callable[..., str], tmp_path: Path) -> None:
     assert (tmp_path / "tank_level.png").read_bytes().startswith(PNG)
 
 
+def test_dc_motor(run: Callable[..., str], tmp_path: Path) -> None:
+    errors = [float(error) for error in re.findall(r"mean squared angle (\S+) rad", run("dc_motor.py"))]
+    controller, imitated, learned = errors
+    assert imitated < 1.3 * controller
+    assert learned < 0.95 * controller
+    assert (tmp_path / "dc_motor.png").read_bytes().startswith(PNG)
+
+
+def test_correct_table(run: Callable[..., str], tmp_path: Path) -> None:
+    steps, leftmost = zip(*re.findall(r": (\d+) steps, leftmost position (\S+)", run("correct_table.py")), strict=True)
+    assert all(int(n) < 130 for n in steps)
+    assert float(leftmost[1]) > float(leftmost[0])
+    assert (tmp_path / "correct_table.png").read_bytes().startswith(PNG)
+
+
 def test_knn_td_from_scratch(run: Callable[..., str]) -> None:
     printed = run("knn_td_from_scratch.py")
     first, *_, last = re.findall(r"episodes .* mean return (\S+)\n", printed)

@@ -19,12 +19,15 @@ LAYERS = (
     ("kernels", "envs", "registry", "distributed", "online_algorithm"),
     ("perception", "q_table"),
     ("actions", "model"),
-    ("learners", "filters"),
+    ("learners", "filters", "export"),
+    ("editing", "datasets"),
     ("policies", "saving"),
-    ("base", "dyna_policies"),
+    ("offline", "dyna_policies"),
+    ("plots",),
+    ("insight",),
+    ("base",),
     ("planning",),
     ("knntd", "exa", "dyna"),
-    ("plots",),
     ("callbacks", "zoo"),
     ("experiments",),
     ("cli",),
@@ -106,9 +109,12 @@ def test_the_layout_in_contributing_names_every_part() -> None:
     assert named == {*HEIGHT, "zoo_configs"}
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["compare", "--help"], ["reproduce", "--help"], ["demo", "--help"]])
+COMMANDS = "compare", "demo", "export", "inspect", "reproduce"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], *([name, "--help"] for name in COMMANDS)])
 def test_help_does_not_wait_for_what_only_the_commands_need(arguments: list[str]) -> None:
-    slow = ("rl_zoo3", "optuna", "matplotlib", "rliable", "pandas", "ray")
+    slow = ("rl_zoo3", "optuna", "matplotlib", "plotly", "rliable", "pandas", "ray", "onnx", "safetensors")
     program = f"""
 import sys
 from sb3_knntd.cli import main

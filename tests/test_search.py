@@ -138,6 +138,23 @@ def test_distances_that_rounding_makes_equal(search: str) -> None:
     assert_same(query(search, points, 60, scaled), expected)
 
 
+@pytest.mark.parametrize(
+    ("shape", "k", "scaled"),
+    [
+        # The same distances in several dimensions, added in another order.
+        ((4, 4, 2, 2, 1), 4, [1.0, -1.0, 0.0, 1.0, 1.0]),
+        ((4, 4, 3, 2, 6), 10, [1.0, -1.0, -0.5, -1.0, 0.8]),
+        ((6, 1, 1, 6, 6), 33, [-0.6, -1.0, -1.0, 0.6000000000000001, 1.0]),
+        # Sums that differ in the last digit, which one more term rounds to the same.
+        ((6, 2, 5, 1), 17, [-0.7999999999999994, 0.0, 0.25, -1.0]),
+    ],
+)
+def test_sums_that_rounding_makes_equal(shape: tuple[int, ...], k: int, scaled: list[float]) -> None:
+    """A point with a lower index was left out where its distance was equal to that of the last neighbour."""
+    rows = np.array([scaled])
+    assert_same(query("lattice", Lattice(shape), k, rows), query("brute", Lattice(shape), k, rows))
+
+
 @given(seed=SEEDS, k=st.integers(1, 30))
 @settings(PROPERTY, max_examples=12)
 def test_trillions_of_points_in_twelve_dimensions(seed: int, k: int) -> None:

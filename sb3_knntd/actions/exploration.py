@@ -70,10 +70,14 @@ class EpsilonGreedy:
 
     def choose(self, values: th.Tensor, uniforms: th.Tensor, rate: float, random_ties: bool) -> th.Tensor:
         best = greedy(values, uniforms[:, 1] if random_ties else None)
-        return th.where(uniforms[:, 0] < rate, pick(uniforms[:, 1], values.shape[-1]), best)
+        # A random one of the best of equal values: of all actions that are not forbidden.
+        drawn = greedy(values > -th.inf, uniforms[:, 1])
+        return th.where(uniforms[:, 0] < rate, drawn, best)
 
     def expectation(self, values: th.Tensor, rate: float) -> th.Tensor:
-        return (1.0 - rate) * values.amax(dim=-1) + rate * values.mean(dim=-1)
+        allowed = values > -th.inf
+        mean = values.where(allowed, 0.0).sum(dim=-1) / allowed.sum(dim=-1)
+        return (1.0 - rate) * values.amax(dim=-1) + rate * mean
 
 
 class Softmax:
@@ -88,7 +92,8 @@ class Softmax:
         return (uniforms[:, :1] * shares[:, -1:] >= shares).sum(dim=-1).clamp(max=values.shape[-1] - 1)
 
     def expectation(self, values: th.Tensor, rate: float) -> th.Tensor:
-        return (th.softmax(values / rate, dim=-1) * values).sum(dim=-1)
+        # 0 * -inf is NaN.
+        return (th.softmax(values / rate, dim=-1) * values).nansum(dim=-1)
 
 
 #: The exploration policies by the name that users pass.

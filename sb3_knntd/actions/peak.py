@@ -7,6 +7,7 @@ import torch as th
 
 from sb3_knntd.actions.columns import ActionColumns
 from sb3_knntd.actions.exploration import EpsilonGreedy, greedy
+from sb3_knntd.actions.rules import Rules
 from sb3_knntd.actions.selection import MeanValueSelector, mean_rows
 from sb3_knntd.kernels.selection import Target
 
@@ -22,10 +23,11 @@ class PeakSelector(MeanValueSelector):
 
     :param columns: the action points, one column for every combination
     :param random_ties: whether ties between best columns are broken at random while training
+    :param rules: where columns are forbidden; nowhere by default
     """
 
-    def __init__(self, columns: ActionColumns, random_ties: bool) -> None:
-        super().__init__(columns, Target.Q_LEARNING, EpsilonGreedy(), random_ties)
+    def __init__(self, columns: ActionColumns, random_ties: bool, rules: Rules | None = None) -> None:
+        super().__init__(columns, Target.Q_LEARNING, EpsilonGreedy(), random_ties, rules)
         if self.n_factors != 1:
             raise ValueError("action_table must be 'joint': a column for every combination of action points")
         shape = [len(points) for points in columns.lists]
@@ -64,7 +66,7 @@ class PeakSelector(MeanValueSelector):
             curvature = (slope_right - slope_left) / (left + right)
             slope = (slope_left * right + slope_right * left) / (left + right)
             offset = (-0.5 * slope / curvature).clamp(min=-0.5 * left, max=0.5 * right)
-            has_peak = (
+            has_peak = offset.isfinite() & (
                 (left > 0)
                 & (right > 0)
                 & (curvature * (left + right) ** 2 < -LEAST_CURVATURE * middle.abs().clamp(min=1.0))
@@ -91,4 +93,5 @@ class PeakSelector(MeanValueSelector):
             np.abs(given[:, dimension, None] - points).argmin(axis=1)
             for dimension, points in enumerate(self.columns.lists)
         ]
-        return np.ravel_multi_index(nearest, shape)[:, None].astype(np.int64)
+        columns: np.ndarray = np.ravel_multi_index(nearest, shape)[:, None].astype(np.int64)
+        return columns

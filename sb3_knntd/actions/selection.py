@@ -11,6 +11,7 @@ import torch as th
 
 from sb3_knntd.actions.columns import ActionColumns
 from sb3_knntd.actions.exploration import ExplorationPolicy, greedy, pick
+from sb3_knntd.actions.rules import Rules
 from sb3_knntd.common.checks import check_member
 from sb3_knntd.kernels.selection import (
     GREEDY,
@@ -41,9 +42,12 @@ class ActionSelector(ABC):
     """
     Selects actions from the rows of the neighbours. With :meth:`kernel_arguments`, the kernels select in the same way.
 
+    In the rows, forbidden actions have the value -inf.
+
     :param columns: the actions that the columns of the table stand for
     :param random_ties: whether ties between best actions are broken at random while training, otherwise the first is
         taken
+    :param rules: where actions are forbidden; nowhere by default
     """
 
     #: number of uniform random numbers used for one selection
@@ -56,9 +60,10 @@ class ActionSelector(ABC):
     min_persistence = 1.0
     persistence_share = 0.0
 
-    def __init__(self, columns: ActionColumns, random_ties: bool) -> None:
+    def __init__(self, columns: ActionColumns, random_ties: bool, rules: Rules | None = None) -> None:
         self.columns = columns
         self.random_ties = random_ties
+        self.rules = Rules(0, int(columns.factors[-1])) if rules is None else rules
 
     @property
     def n_factors(self) -> int:
@@ -89,6 +94,7 @@ class ActionSelector(ABC):
             persistence_share=self.persistence_share,
             factors=self.columns.factors,
             action_points=self.columns.points,
+            **self.rules.kernel_arguments(),
         )
 
     def persist(self, persistent: th.Tensor, uniforms: th.Tensor, rate: float, lengths: th.Tensor) -> th.Tensor:
@@ -158,13 +164,20 @@ class ActionSelector(ABC):
         """
 
     @abstractmethod
-    def value(self, rows: th.Tensor, probabilities: th.Tensor, action_indices: th.Tensor) -> th.Tensor:
+    def value(
+        self,
+        rows: th.Tensor,
+        probabilities: th.Tensor,
+        action_indices: th.Tensor,
+        allowed: th.Tensor | None = None,
+    ) -> th.Tensor:
         """
         The current value of a state and the action taken in it (eqs. 8 and 25).
 
         :param rows: table rows of the neighbours, shape (batch, k, n_actions)
         :param probabilities: of the neighbours, shape (batch, k), the table's dtype
         :param action_indices: the columns that were selected, shape (batch, k, n_factors)
+        :param allowed: the same rows with -inf at forbidden actions; by default ``rows``
         :return: shape (batch,)
         """
 
@@ -192,15 +205,20 @@ class ActionSelector(ABC):
         ]
         return (probabilities * th.cat(chosen, dim=2).mean(dim=2)).sum(dim=1)
 
-    def random_columns(self, uniforms: np.ndarray) -> np.ndarray:
+    def random_columns(self, uniforms: np.ndarray, observations: np.ndarray) -> np.ndarray:
         """
-        Draw columns uniformly at random.
+        Draw columns uniformly at random from those that are allowed.
 
         :param uniforms: random numbers in [0, 1), shape (batch, n_factors)
+        :param observations: the states to act in, shape (batch, *obs_shape), observation units
         :return: a column for each action factor, shape (batch, n_factors), int64
         """
-        factors = self.columns.factors
-        drawn: np.ndarray = factors[:-1] + (uniforms * np.diff(factors)).astype(np.int64)
+        allowed = ~self.rules.forbidden(th.from_numpy(observations)).cpu()
+        ranks = th.from_numpy(uniforms)
+        drawn: np.ndarray = th.stack(
+            [first + greedy(allowed[:, first:end], ranks[:, f]) for f, (first, end) in enumerate(self.factor_ranges)],
+            dim=1,
+        ).numpy()
         return drawn
 
 
@@ -224,15 +242,21 @@ class MeanValueSelector(ActionSelector):
     :param exploration: the policy while training
     :param random_ties: whether ties between best actions are broken at random while training, otherwise the first is
         taken
+    :param rules: where actions are forbidden; nowhere by default
     """
 
     _COMBINATION = Combination.OF_VALUES
     _GREEDY_EXPLORATION = Exploration.EPSILON_GREEDY
 
     def __init__(
-        self, columns: ActionColumns, target: Target, exploration: ExplorationPolicy, random_ties: bool
+        self,
+        columns: ActionColumns,
+        target: Target,
+        exploration: ExplorationPolicy,
+        random_ties: bool,
+        rules: Rules | None = None,
     ) -> None:
-        super().__init__(columns, random_ties)
+        super().__init__(columns, random_ties, rules)
         self.target = target
         self.policy = exploration
         self.exploration = exploration.CODE
@@ -278,7 +302,13 @@ class MeanValueSelector(ActionSelector):
             raise ValueError(f"actions must be from 0 to {n_actions - 1}; got {columns.min()} to {columns.max()}")
         return columns[:, None].astype(np.int64)
 
-    def value(self, rows: th.Tensor, probabilities: th.Tensor, action_indices: th.Tensor) -> th.Tensor:
+    def value(
+        self,
+        rows: th.Tensor,
+        probabilities: th.Tensor,
+        action_indices: th.Tensor,
+        allowed: th.Tensor | None = None,
+    ) -> th.Tensor:
         return (probabilities * rows.gather(2, action_indices)[..., 0]).sum(dim=1)
 
     def greedy_value(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
@@ -302,6 +332,7 @@ class MeanActionSelector(ActionSelector):
     :param n_neighbors: k
     :param random_ties: whether ties between best columns are broken at random while training, otherwise the first is
         taken
+    :param rules: where columns are forbidden; nowhere by default
     """
 
     _COMBINATION = Combination.OF_ACTIONS
@@ -315,8 +346,9 @@ class MeanActionSelector(ActionSelector):
         persistence_share: float,
         n_neighbors: int,
         random_ties: bool,
+        rules: Rules | None = None,
     ) -> None:
-        super().__init__(columns, random_ties)
+        super().__init__(columns, random_ties, rules)
         self.exploration = check_member("exploration", exploration, (Exploration.SHARED, Exploration.PER_NEIGHBOR))
         self.min_persistence = float(min_persistence)
         self.persistence_share = float(persistence_share)
@@ -346,11 +378,13 @@ class MeanActionSelector(ActionSelector):
         for factor, (first, end) in enumerate(self.factor_ranges):
             column = first + greedy(rows[..., first:end], ties[..., factor] if self.random_ties else None)
             if self.exploration is Exploration.SHARED:
-                column = th.where(persistent[:, factor, None] >= 0, persistent[:, factor, None], column)
+                drawn = persistent[:, factor, None].expand(batch, k)
+                explores = drawn >= 0
             else:
                 drawn = first + pick(ties[..., factor], end - first)
-                column = th.where(explore.reshape(batch, k, -1)[..., factor] < rate, drawn, column)
-            selected.append(column)
+                explores = explore.reshape(batch, k, -1)[..., factor] < rate
+            is_allowed = rows.gather(2, drawn.clamp(min=0)[..., None])[..., 0] > -th.inf
+            selected.append(th.where(explores & is_allowed, drawn, column))
         action_indices = th.stack(selected, dim=2)
         actions = self.actions_of(action_indices, probabilities)
         return Selection(actions, action_indices, self.greedy_value(rows, probabilities))
@@ -361,6 +395,11 @@ class MeanActionSelector(ActionSelector):
     def actions_of(self, action_indices: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
         points = self._points.to(probabilities)
         return (probabilities[..., None] * points[action_indices].sum(dim=2)).sum(dim=1)
+
+    def greedy_actions(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+        points = self._points.to(probabilities)[self.greedy_indices(rows, probabilities)].sum(dim=2)
+        # Added one after the other, as in the kernels, so that both are rounded in the same way.
+        return (probabilities[..., None] * points).cumsum(dim=1)[:, -1]
 
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
         vectors, points = np.asarray(actions, dtype=np.float64), self.columns.points
@@ -374,8 +413,14 @@ class MeanActionSelector(ActionSelector):
             nearest.append(first + distances.sum(axis=2).argmin(axis=1))
         return np.stack(nearest, axis=1).astype(np.int64)
 
-    def value(self, rows: th.Tensor, probabilities: th.Tensor, action_indices: th.Tensor) -> th.Tensor:
-        return self.greedy_value(rows, probabilities)
+    def value(
+        self,
+        rows: th.Tensor,
+        probabilities: th.Tensor,
+        action_indices: th.Tensor,
+        allowed: th.Tensor | None = None,
+    ) -> th.Tensor:
+        return self.greedy_value(rows if allowed is None else allowed, probabilities)
 
     def greedy_value(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
         best = [rows[..., first:end].amax(dim=-1) for first, end in self.factor_ranges]

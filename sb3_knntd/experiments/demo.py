@@ -150,6 +150,8 @@ def demo(env_id: str, steps: int, seed: int, out: Path) -> bool:
     _print_returns(f"Return on {env_id}", {name: learned, "random policy": random})
     if step_limit is not None:
         print(f"The environment has no step limit: evaluation episodes were cut at {step_limit:,} steps.")
+    for finding in loaded.diagnose():
+        print(f"Check {finding}")
 
     files["learning curve"] = out / f"{stem}_learning_curve.png"
     axes = plot_learning_curve(

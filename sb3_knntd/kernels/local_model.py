@@ -2,8 +2,8 @@
 A model of an environment from nearest transitions: a local linear fit at each point and action.
 
 Each (point, action) has a list of the transitions nearest to it. A new transition is compared with every point once, so
-no search tree is needed, and only the fits whose list has changed are made anew. All states are in scaled units. Actions
-of a Box are inputs of the fit, in units in which they count as distance; Discrete actions have fits of their own.
+no search tree is needed, and only the fits whose list has changed are made anew. All states are in scaled units. Box
+actions are inputs of the fit, in units in which they count as distance; Discrete actions have fits of their own.
 """
 
 from __future__ import annotations
@@ -82,7 +82,8 @@ class FitConfig(NamedTuple):
     """
     Parameters of the fits.
 
-    :param actions: the action points of a Box, shape (n_actions, action_dim), units of distance; Discrete: (n_actions, 0)
+    :param actions: the action points of a Box, shape (n_actions, action_dim), units of distance; Discrete: shape
+        (n_actions, 0)
     :param n_fitted: number of transitions that set the bandwidth of a fit
     :param spacing: h, scaled units
     :param reach: largest distance of the nearest transition at which an action is known, scaled units

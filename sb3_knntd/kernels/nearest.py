@@ -40,7 +40,52 @@ def _coordinates_up_to(x, axes, first, end):
 
 
 @jit
-def _first_on_lattice(scaled, axes, offsets, count):
+def _left_out(x, axes, first, end, before, numbers_before, filled, sums, numbers, count, blur):
+    """
+    Whether a sum that was left out of a list could be as good as one of the list. Either it comes before the last one
+    by (sum, index), which it can where rounding has made sums equal. Or one of the list is so little below it that a
+    later sum could round both to the same.
+
+    :param x: value in the last dimension of the list, scaled units
+    :param axes: see :func:`nearest_on_lattice`
+    :param first: index of the first coordinate of the dimension
+    :param end: index after its last coordinate
+    :param before: sums of the list of the dimensions before, ascending
+    :param numbers_before: indices of that list
+    :param filled: its length
+    :param sums: the list, ascending
+    :param numbers: indices of the list
+    :param count: length of the list
+    :param blur: largest difference that rounding can undo; 0 in the last dimension
+    """
+    size, n_up_to_last = end - first, 0
+    last, number, place = sums[count - 1], numbers[count - 1], count - 1
+    while place > 0 and sums[place] == last:
+        place -= 1
+    close = last - blur <= sums[place] < last
+    above = first + _coordinates_up_to(x, axes, first, end)
+    below = above - 1
+    while below >= first or above < end:
+        coordinate, square = _next_coordinate(x, axes, below, above, first, end)
+        if before[0] + square > last + blur:
+            break
+        for place in range(filled):
+            total = before[place] + square
+            if total > last + blur:
+                break
+            listed = total < last or numbers_before[place] * size + coordinate - first <= number
+            if total > last or (close and not listed):
+                return True
+            n_up_to_last += listed
+        if coordinate == below:
+            below -= 1
+        else:
+            above += 1
+    return n_up_to_last > count
+
+
+@jit
+def _first_on_lattice(scaled, axes, offsets, count, blur):
     """
     Find the ``count`` points with the smallest squared distances.
 
@@ -53,14 +98,16 @@ def _first_on_lattice(scaled, axes, offsets, count):
     :param axes: see :func:`nearest_on_lattice`
     :param offsets: see :func:`nearest_on_lattice`
     :param count: number of points to find, at most the number of points of the lattice
-    :return: squared distances and indices, by (distance, index) but for rounding, shape (count,) each
+    :param blur: largest difference between sums that rounding can undo; negative if it is not to be looked for
+    :return: squared distances and indices, by (distance, index) but for rounding, shape (count,) each, and whether
+        rounding may have left out a point that ties with one of them, see :func:`_left_out`
     """
     # The new and the old list. For each row: the squared distance of its coordinate, its next sum, its coordinate, and
     # its position in the old list.
     floats, integers = np.empty((4, count)), np.empty((4, count), np.int64)
     sums, before, squares, nexts = floats[0], floats[1], floats[2], floats[3]
     numbers, numbers_before, coordinates, places = integers[0], integers[1], integers[2], integers[3]
-    sums[0], numbers[0], filled = 0.0, 0, 1
+    sums[0], numbers[0], filled, blurred = 0.0, 0, 1, False
     for j in range(len(scaled)):
         first, end = offsets[j], offsets[j + 1]
         size, x = end - first, scaled[j]
@@ -97,33 +144,11 @@ def _first_on_lattice(scaled, axes, offsets, count):
             nexts[row] = before[places[row]] + squares[row] if places[row] < filled else np.inf
             while opened < n_rows and places[opened] == filled:
                 opened += 1
+        if blur >= 0.0 and not blurred and n_merged < filled * size:
+            near = blur if j < len(scaled) - 1 else 0.0
+            blurred = _left_out(x, axes, first, end, before, numbers_before, filled, sums, numbers, n_merged, near)
         filled = n_merged
-    return sums, numbers
-
-
-@jit
-def _blurred(scaled, axes, offsets, total):
-    """
-    Whether rounding could make sums of about ``total`` equal for two coordinates at different distances. If not, equal
-    sums have equal terms, and their order is that of the indices.
-    """
-    least = 2.0 * len(scaled) * 2.3e-16 * total
-    for j in range(len(scaled)):
-        first, end = offsets[j], offsets[j + 1]
-        above = first + _coordinates_up_to(scaled[j], axes, first, end)
-        below, before = above - 1, -np.inf
-        while below >= first or above < end:
-            coordinate, square = _next_coordinate(scaled[j], axes, below, above, first, end)
-            if square > total + least:
-                break
-            if 0.0 < square - before <= least:
-                return True
-            before = square
-            if coordinate == below:
-                below -= 1
-            else:
-                above += 1
-    return False
+    return sums, numbers, blurred
 
 
 @jit
@@ -148,11 +173,13 @@ def nearest_on_lattice(scaled, axes, offsets, k, indices, distances):
         n_points *= offsets[j + 1] - offsets[j]
     # One more point shows whether the k-th is tied.
     count = min(k + 1, n_points)
-    sums, numbers = _first_on_lattice(scaled, axes, offsets, count)
-    if count > k and sums[k] == sums[k - 1] and _blurred(scaled, axes, offsets, sums[k]):
-        while count < n_points and sums[count - 1] == sums[k - 1]:
+    sums, numbers, blurred = _first_on_lattice(scaled, axes, offsets, count, -1.0)
+    if count > k and sums[k] == sums[k - 1]:
+        blur = 2.0 * len(scaled) * 2.3e-16 * sums[k]
+        sums, numbers, blurred = _first_on_lattice(scaled, axes, offsets, count, blur)
+        while blurred and count < n_points and sums[count - 1] == sums[k - 1]:
             count = min(2 * count, n_points)
-            sums, numbers = _first_on_lattice(scaled, axes, offsets, count)
+            sums, numbers, _ = _first_on_lattice(scaled, axes, offsets, count, -1.0)
     for i in range(k):
         indices[i] = numbers[i]
         distances[i] = sums[i]

@@ -1,8 +1,8 @@
 """
 Planning on a table: held actions, value iteration, and simulated episodes.
 
-The values at the points are planned in two ways over one model. Value iteration is fast, and global; with it, what is not
-known can be given an optimistic value. It averages values where a held action ends, so it is blurred near a cliff.
+The values at the points are planned in two ways over one model. Value iteration is fast and global, and can give an
+optimistic value to what is not known. It averages values where a held action ends, so it is blurred near a cliff.
 Simulated episodes correct this: they follow the greedy policy step by step, and TD(λ) learns from them.
 """
 

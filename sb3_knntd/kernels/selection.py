@@ -52,6 +52,10 @@ class SelectionArguments(NamedTuple):
     :param factors: index of the first column of each action factor, and the number of columns, shape (n_factors + 1,),
         int64
     :param action_points: the action of each column, shape (n_actions, action_dim), action units
+    :param n_rules: number of rules that forbid actions in a region
+    :param rule_low: the lower corners of the regions, shape (n_rules, obs_dim), observation units
+    :param rule_high: the upper corners of the regions, shape (n_rules, obs_dim), observation units
+    :param rule_columns: the columns that each rule forbids, shape (n_rules, n_actions), bool
     """
 
     combination: int
@@ -62,12 +66,60 @@ class SelectionArguments(NamedTuple):
     persistence_share: float
     factors: np.ndarray
     action_points: np.ndarray
+    n_rules: int
+    rule_low: np.ndarray
+    rule_high: np.ndarray
+    rule_columns: np.ndarray
+
+
+@jit
+def apply_rules(observation, selection, forbidden):
+    """
+    Find the columns that the rules forbid in a state.
+
+    :param observation: observation units, shape (obs_dim,)
+    :param selection: see :class:`SelectionArguments`
+    :param forbidden: output, shape (n_actions,), bool
+    """
+    forbidden[:] = False
+    for rule in range(selection.n_rules):
+        inside = True
+        for j in range(len(observation)):
+            if not selection.rule_low[rule, j] <= observation[j] <= selection.rule_high[rule, j]:
+                inside = False
+        if inside:
+            for action in range(len(forbidden)):
+                forbidden[action] |= selection.rule_columns[rule, action]
+
+
+@inlined
+def mask(row, forbidden):
+    """Set the values of forbidden columns to -inf."""
+    for action in range(len(row)):
+        if forbidden[action]:
+            row[action] = -np.inf
 
 
 @inlined
 def pick(uniform, n):
     """An integer in [0, n) from a uniform random number."""
     return min(np.int64(uniform * n), n - 1)
+
+
+@inlined
+def pick_allowed(values, uniform):
+    """A random one of the actions whose value is not -inf."""
+    n_allowed = 0
+    for action in range(len(values)):
+        if values[action] > -np.inf:
+            n_allowed += 1
+    rank = pick(uniform, n_allowed)
+    for action in range(len(values)):
+        if values[action] > -np.inf:
+            if rank == 0:
+                return action
+            rank -= 1
+    return 0
 
 
 @inlined
@@ -116,14 +168,15 @@ def _explore(values, uniforms, rate, exploration, random_ties, shares):
     n_actions = len(values)
     if exploration == Exploration.EPSILON_GREEDY:
         if uniforms[0] < rate:
-            return pick(uniforms[1], n_actions)
+            return pick_allowed(values, uniforms[1])
         return greedy_action(values, 0, n_actions, uniforms[1], random_ties)
     if exploration == Exploration.SOFTMAX:
         _softmax(values, rate, shares)
         total, reached, action = shares.sum(), 0.0, 0
         for candidate in range(n_actions):
             reached += shares[candidate]
-            action = candidate
+            if shares[candidate] > 0.0:
+                action = candidate
             if uniforms[0] * total < reached:
                 break
         return action
@@ -142,11 +195,15 @@ def _target_value(values, action, rate, target, exploration, shares):
     if target == Target.EXPECTED_SARSA:
         mean = 0.0
         if exploration == Exploration.EPSILON_GREEDY:
+            n_allowed = 0
             for candidate in range(n_actions):
-                mean += values[candidate]
-            return (1.0 - rate) * best + rate * (mean / n_actions)
+                if values[candidate] > -np.inf:
+                    mean += values[candidate]
+                    n_allowed += 1
+            return (1.0 - rate) * best + rate * (mean / n_allowed)
         for candidate in range(n_actions):
-            mean += shares[candidate] * values[candidate]
+            if shares[candidate] > 0.0:
+                mean += shares[candidate] * values[candidate]
         return mean
     raise ValueError("the kernels do not know this target")
 
@@ -164,9 +221,11 @@ def _mean_row(indices, probabilities, state, means, row):
 
 
 @inlined
-def _select_from_mean(indices, probabilities, uniforms, rate, state, action_indices):
+def _select_from_mean(indices, probabilities, uniforms, rate, state, forbidden, action_indices):
     means, row = state.means, state.row
     _mean_row(indices, probabilities, state, means, row)
+    if state.n_rules > 0:
+        mask(means, forbidden)
     action = _explore(means, uniforms, rate, state.exploration, state.random_ties, row)
     for i in range(len(indices)):
         action_indices[i, 0] = action
@@ -174,7 +233,9 @@ def _select_from_mean(indices, probabilities, uniforms, rate, state, action_indi
 
 
 @inlined
-def _select_from_each(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action):
+def _select_from_each(
+    indices, probabilities, uniforms, rate, persistent, state, forbidden, action_indices, mean_action
+):
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
     entries, slots, clock = state.active_entries, state.active_slots, state.clock
     factors, action_points, row = state.factors, state.action_points, state.row
@@ -183,17 +244,21 @@ def _select_from_each(indices, probabilities, uniforms, rate, persistent, state,
     value = 0.0
     for i in range(k):
         read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
+        if state.n_rules > 0:
+            mask(row, forbidden)
         for factor in range(n_factors):
             first, end = factors[factor], factors[factor + 1]
             uniform = uniforms[2 + n_factors + i * n_factors + factor]
             column = greedy_action(row, first, end, uniform, state.random_ties)
             value += probabilities[i] * row[column]
             if state.exploration == Exploration.SHARED:
-                if persistent[factor] >= 0:
+                if persistent[factor] >= 0 and row[persistent[factor]] > -np.inf:
                     column = persistent[factor]
             elif state.exploration == Exploration.PER_NEIGHBOR:
                 if uniforms[2 + n_factors + (k + i) * n_factors + factor] < rate:
-                    column = first + pick(uniform, end - first)
+                    drawn = first + pick(uniform, end - first)
+                    if row[drawn] > -np.inf:
+                        column = drawn
             else:
                 raise ValueError("the kernels do not know this exploration of continuous actions")
             action_indices[i, factor] = column
@@ -203,7 +268,7 @@ def _select_from_each(indices, probabilities, uniforms, rate, persistent, state,
 
 
 @inlined
-def select(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action):
+def select(indices, probabilities, uniforms, rate, persistent, state, forbidden, action_indices, mean_action):
     """
     Select the action in one state (eqs. 8 to 10; eqs. 19 to 21 and 27).
 
@@ -213,32 +278,39 @@ def select(indices, probabilities, uniforms, rate, persistent, state, action_ind
     :param rate: ε or the temperature
     :param persistent: columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (n_factors,)
     :param state: see :mod:`sb3_knntd.kernels.state`
+    :param forbidden: columns that must not be selected, shape (n_actions,), bool; not read if there are no rules
     :param action_indices: output, the column that each neighbour selects for each factor, shape (k, n_factors)
     :param mean_action: output, the mean of the action points, shape (action_dim,)
     :return: the value of the state as a target (eqs. 11, 12 and 25)
     """
     if state.combination == Combination.OF_VALUES:
-        return _select_from_mean(indices, probabilities, uniforms, rate, state, action_indices)
+        return _select_from_mean(indices, probabilities, uniforms, rate, state, forbidden, action_indices)
     if state.combination == Combination.OF_ACTIONS:
-        return _select_from_each(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action)
+        return _select_from_each(
+            indices, probabilities, uniforms, rate, persistent, state, forbidden, action_indices, mean_action
+        )
     raise ValueError("the kernels do not know this combination")
 
 
 @jit
-def greedy_and_given_value(indices, probabilities, columns, state):
+def greedy_and_given_value(indices, probabilities, columns, state, forbidden):
     """
-    The values of the greedy action and of a given action in a state.
+    The values of the greedy action and of a given action in a state. The given one may be forbidden.
 
     :param indices: neighbours, shape (k,)
     :param probabilities: of the neighbours, shape (k,)
     :param columns: the given action, a column for each factor, shape (n_factors,)
     :param state: see :mod:`sb3_knntd.kernels.state`
+    :param forbidden: columns that are not greedy, shape (n_actions,), bool; not read if there are no rules
     :return: both values
     """
     means, row, factors = state.means, state.row, state.factors
     if state.combination == Combination.OF_VALUES:
         _mean_row(indices, probabilities, state, means, row)
-        return largest(means, 0, len(means)), means[columns[0]]
+        given = means[columns[0]]
+        if state.n_rules > 0:
+            mask(means, forbidden)
+        return largest(means, 0, len(means)), given
     values, row_slots, initial_value = state.values, state.row_slots, state.initial_value
     entries, slots, clock = state.active_entries, state.active_slots, state.clock
     n_factors = len(columns)
@@ -246,8 +318,11 @@ def greedy_and_given_value(indices, probabilities, columns, state):
     for i in range(len(indices)):
         read_row(indices[i], values, row_slots, initial_value, entries, slots, clock, row)
         for factor in range(n_factors):
-            greedy += probabilities[i] * largest(row, factors[factor], factors[factor + 1]) / n_factors
             given += probabilities[i] * row[columns[factor]] / n_factors
+        if state.n_rules > 0:
+            mask(row, forbidden)
+        for factor in range(n_factors):
+            greedy += probabilities[i] * largest(row, factors[factor], factors[factor + 1]) / n_factors
     return greedy, given
 
 

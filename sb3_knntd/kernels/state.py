@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_knntd.kernels.experience import ExperienceArrays
 from sb3_knntd.kernels.jit import AVAILABLE, jit
 from sb3_knntd.kernels.perceive import PerceptionArguments
 from sb3_knntd.kernels.selection import SelectionArguments
@@ -47,8 +48,10 @@ class EpisodeArrays(NamedTuple):
     :param actions: means of the action points, shape (3, n_envs, action_dim)
     :param truncated: whether the episode was truncated, shape (n_envs,), bool
     :param last_observations: the last observation before the truncation, shape (n_envs, obs_dim)
+    :param current_observations: the observation before the step, shape (n_envs, obs_dim); infinite if unknown
     :param persistent: columns being explored, or ``GREEDY`` or ``UNDRAWN``, shape (n_envs, n_factors), int64
     :param lengths: see :func:`~sb3_knntd.kernels.selection.count_steps`
+    :param forbidden: the columns that the rules forbid, shape (3, n_envs, n_actions), bool, with the states as above
     """
 
     indices: np.ndarray
@@ -57,8 +60,10 @@ class EpisodeArrays(NamedTuple):
     actions: np.ndarray
     truncated: np.ndarray
     last_observations: np.ndarray
+    current_observations: np.ndarray
     persistent: np.ndarray
     lengths: np.ndarray
+    forbidden: np.ndarray
 
 
 class RandomRows(NamedTuple):
@@ -107,6 +112,7 @@ GROUPS = (
     EpisodeArrays,
     RandomRows,
     WorkArrays,
+    ExperienceArrays,
 )
 FIELDS = tuple(field for group in GROUPS for field in group._fields)
 

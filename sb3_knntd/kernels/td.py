@@ -6,15 +6,18 @@ from functools import cache, partial
 
 import numpy as np
 
+from sb3_knntd.kernels.experience import record_steps
 from sb3_knntd.kernels.jit import inlined, jit
 from sb3_knntd.kernels.perceive import SearchKind, perceive
 from sb3_knntd.kernels.selection import (
     UNDRAWN,
     Combination,
     Exploration,
+    apply_rules,
     count_steps,
     greedy_and_given_value,
     largest,
+    mask,
     persist,
     select,
 )
@@ -24,6 +27,7 @@ from sb3_knntd.kernels.traces import (
     LEAST_CLOCK,
     activate,
     active_value,
+    count_visit,
     end_episode,
     find,
     flush,
@@ -47,7 +51,7 @@ OK, NEED_RANDOM, NEED_CAPACITY, NEED_POINTS, BAD_RATE, NOT_FINITE, DIVERGED = ra
 @jit
 def perceive_into(state, observation, which, env):
     """
-    Perceive an observation. The neighbours and their probabilities are stored in the state.
+    Perceive an observation. The neighbours, their probabilities and the forbidden actions are stored in the state.
 
     :param state: see :mod:`sb3_knntd.kernels.state`
     :param observation: observation units, shape (obs_dim,)
@@ -56,6 +60,8 @@ def perceive_into(state, observation, which, env):
     :return: whether it has to become a point
     """
     indices, probabilities = state.indices[which, env], state.probabilities[which, env]
+    if state.n_rules > 0:
+        apply_rules(observation, state, state.forbidden[which, env])
     return perceive(observation, state, indices, probabilities) > state.squared_spacing
 
 
@@ -72,12 +78,12 @@ def select_at(state, uniforms, rate, which, env):
     :return: the value of the state as a target
     """
     indices, probabilities = state.indices[which, env], state.probabilities[which, env]
-    persistent = state.persistent[env]
+    persistent, forbidden = state.persistent[env], state.forbidden[which, env]
     # The action at a truncated state is never executed; leave the persistent action unchanged.
     if state.exploration == Exploration.SHARED and which != TERMINAL:
         persist(uniforms, rate, state.lengths, env, state, persistent)
     action_indices, mean_action = state.action_indices[which, env], state.actions[which, env]
-    return select(indices, probabilities, uniforms, rate, persistent, state, action_indices, mean_action)
+    return select(indices, probabilities, uniforms, rate, persistent, state, forbidden, action_indices, mean_action)
 
 
 @jit
@@ -93,6 +99,7 @@ def begin(state, observations, uniforms, rate):
     state.lengths[1:] = 0.0
     for env in range(len(observations)):
         state.persistent[env, :] = UNDRAWN
+        state.current_observations[env] = observations[env]
         perceive_into(state, observations[env], CURRENT, env)
         select_at(state, uniforms[env], rate, CURRENT, env)
 
@@ -151,6 +158,8 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
                     read_active_row(entries, place, clock, row)
                 else:
                     read_stored_row(indices[env, i], values, row_slots, initial_value, row)
+                if state.n_rules > 0:
+                    mask(row, state.forbidden[CURRENT, env])
                 for factor in range(n_factors):
                     value += probability * largest(row, factors[factor], factors[factor + 1]) / n_factors
             squares += probability * probability
@@ -172,6 +181,7 @@ def update_table(state, target_values, rewards, ended, learning_rate, trace_deca
                 place = find(indices[env, i], slots)
                 if place < 0:
                     place = activate(indices[env, i], state, state)
+            count_visit(indices[env, i], state.visits, row_slots)
             for factor in range(n_factors):
                 entry = chosen[env, i, factor]
                 if state.accumulating:
@@ -217,6 +227,8 @@ def _advance(state):
             probabilities[CURRENT, env, i] = probabilities[NEXT, env, i]
             for factor in range(n_factors):
                 entries[CURRENT, env, i, factor] = entries[NEXT, env, i, factor]
+    if state.n_rules > 0:
+        state.forbidden[CURRENT] = state.forbidden[NEXT]
 
 
 @inlined
@@ -287,6 +299,7 @@ def learn(state, observations, rewards, ended, learning_rate, trace_decay, rate)
         target_values[env] = value
     outcome = update_table(state, target_values, rewards, ended, learning_rate, trace_decay)
     if outcome == OK:
+        record_steps(state, observations, rewards, ended)
         _advance(state)
     return outcome
 
@@ -323,6 +336,8 @@ def recommend(state, observations, uniforms, indices, probabilities, action_indi
     """
     for row in range(len(observations)):
         perceive(observations[row], state, indices[row], probabilities[row])
+        if state.n_rules > 0:
+            apply_rules(observations[row], state, state.forbidden[CURRENT, 0])
         select(
             indices[row],
             probabilities[row],
@@ -330,6 +345,7 @@ def recommend(state, observations, uniforms, indices, probabilities, action_indi
             0.0,
             state.persistent[0],
             state,
+            state.forbidden[CURRENT, 0],
             action_indices[row],
             state.actions[CURRENT, 0],
         )
@@ -379,9 +395,12 @@ def update(
             if state.search == SearchKind.OUTSIDE:
                 indices[:] = found[which, t]
                 probabilities[:] = distances[which, t]
-            perceive(observations[t] if which == CURRENT else next_observations[t], state, indices, probabilities)
+            observation = observations[t] if which == CURRENT else next_observations[t]
+            perceive(observation, state, indices, probabilities)
+            if state.n_rules > 0:
+                apply_rules(observation, state, state.forbidden[which, 0])
         indices, probabilities = state.indices[CURRENT, 0], state.probabilities[CURRENT, 0]
-        greedy, given = greedy_and_given_value(indices, probabilities, columns[t], state)
+        greedy, given = greedy_and_given_value(indices, probabilities, columns[t], state, state.forbidden[CURRENT, 0])
         if goes_on and given < greedy:
             end_episode(0, state, state)
             state.trace_bound[0] = 0.0
@@ -390,7 +409,7 @@ def update(
         target_values[0] = 0.0
         if not terminated[t]:
             target_values[0], _ = greedy_and_given_value(
-                state.indices[NEXT, 0], state.probabilities[NEXT, 0], columns[t], state
+                state.indices[NEXT, 0], state.probabilities[NEXT, 0], columns[t], state, state.forbidden[NEXT, 0]
             )
         reward[0], last[0] = rewards[t], ended[t]
         outcome = update_table(state, target_values, reward, last, learning_rate, trace_decay)

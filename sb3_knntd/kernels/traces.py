@@ -30,6 +30,8 @@ LEAST_TRACE = 1e-18
 LEAST_CLOCK = 1e-4
 #: Larger values are considered diverged. Sums of values still fit into float32.
 LARGEST_VALUE = 1e30
+#: Visits are counted up to this number. As an int32 there is room for those of a whole step.
+MOST_VISITS = 2**30
 
 
 class TableArrays(NamedTuple):
@@ -37,7 +39,7 @@ class TableArrays(NamedTuple):
     The Q-table.
 
     :param values: shape (n_rows, n_actions)
-    :param visited: a bit for each row: whether it has been updated by learning, uint8; empty if every row has
+    :param visits: number of learning steps that have updated each row, shape (n_rows,), int32
     :param row_points: the point of each row, shape (n_rows,), int64; empty if row i is that of point i
     :param row_slots: hash from points to rows; empty if row i is that of point i
     :param n_rows: number of rows in use, shape (1,), int64; not used if row i is that of point i
@@ -45,7 +47,7 @@ class TableArrays(NamedTuple):
     """
 
     values: np.ndarray
-    visited: np.ndarray
+    visits: np.ndarray
     row_points: np.ndarray
     row_slots: np.ndarray
     n_rows: np.ndarray
@@ -168,6 +170,14 @@ def read_row(point, values, row_slots, initial_value, entries, slots, clock, row
         read_stored_row(point, values, row_slots, initial_value, row)
 
 
+@inlined
+def count_visit(point, visits, row_slots):
+    """Count a learning step that updates a point, which must have a row in the table."""
+    row = row_of(point, row_slots)
+    if visits[row] < MOST_VISITS:
+        visits[row] += 1
+
+
 @jit
 def activate(point, table, traces):
     """Make a point active, and add a row to the table if it has none; its place."""
@@ -177,8 +187,6 @@ def activate(point, table, traces):
         table.n_rows[0] += 1
         table.row_points[row] = point
         insert(point, row, table.row_slots)
-    elif len(table.visited) > 0:
-        table.visited[row >> 3] |= np.uint8(1 << (row & 7))
     place = traces.n_active[0]
     traces.n_active[0] += 1
     traces.active_points[place] = point

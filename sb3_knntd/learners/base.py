@@ -16,7 +16,7 @@ from sb3_knntd.kernels.selection import UNDRAWN
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE, LEAST_CLOCK
 from sb3_knntd.learners.growth import grow, lay_anew
-from sb3_knntd.perception import GrowingPoints, Perceiver
+from sb3_knntd.perception import Experience, GrowingPoints, Perceiver
 from sb3_knntd.q_table import QTable
 from sb3_knntd.q_table.active_traces import SMALLEST_CAPACITY
 
@@ -111,19 +111,29 @@ class Learner(ABC):
     :param selector: selects actions
     :param n_envs: number of environments
     :param config: variant of the update
+    :param experience: where each step is recorded
     """
 
     #: whether the state of the episodes is known; if not, call :meth:`begin`
     in_episodes = False
+    #: version of the rules that the current actions obey
+    rules_version = 0
 
     def __init__(
-        self, perceiver: Perceiver, table: QTable, selector: ActionSelector, n_envs: int, config: UpdateConfig
+        self,
+        perceiver: Perceiver,
+        table: QTable,
+        selector: ActionSelector,
+        n_envs: int,
+        config: UpdateConfig,
+        experience: Experience,
     ) -> None:
         self.perceiver = perceiver
         self.table = table
         self.selector = selector
         self.n_envs = n_envs
         self.config = config
+        self.experience = experience
         #: number of environments, neighbours, and action factors
         self.shape = n_envs, perceiver.search.n_neighbors, selector.n_factors
 
@@ -189,8 +199,12 @@ class Learner(ABC):
         seen = np.concatenate((observations, list(truncated.values()))) if truncated else observations
         grow(self.perceiver, self.table, seen)
 
-    def _grow_for(self, transitions: Transitions) -> None:
-        """Make points of given observations as if they had been visited."""
+    def grow_for(self, transitions: Transitions) -> None:
+        """
+        Make points of given observations as if they had been visited, if the points grow.
+
+        :param transitions: the transitions
+        """
         points = self.perceiver.points
         if not isinstance(points, GrowingPoints):
             return
@@ -202,6 +216,13 @@ class Learner(ABC):
                 self.abandon_episodes()
             grow(self.perceiver, self.table, seen)
         grow(self.perceiver, self.table, seen)
+
+    def _record(self, transitions: Transitions, n: int) -> None:
+        """Record the first ``n`` transitions."""
+        rows = [th.as_tensor(np.asarray(array)[:n]) for array in transitions]
+        before, after = (array.reshape(n, self.perceiver.bounds.obs_dim) for array in (rows[0], rows[3]))
+        # Both observations of a given transition belong to it, also at the end of an episode.
+        self.experience.record(before, after, rows[2].reshape(n), th.zeros(n, dtype=th.bool), self.perceiver.bounds)
 
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
         """
@@ -250,11 +271,20 @@ class Learner(ABC):
             # All zeros if it was saved outside of episodes. Then the rest is not used, and may be of dropped points.
             in_episodes = bool(probabilities.any())
         if in_episodes:
+            # Files of versions without rules do not have it.
+            state_dict = {"forbidden": th.zeros(self.n_envs, self.table.n_actions, dtype=th.bool), **state_dict}
             self._check_state(state_dict)
         self._forget()
         self.in_episodes = in_episodes
         if in_episodes:
+            self.rules_version = self.selector.rules.version
             self._take_over(state_dict)
+
+    def _observations_in(self, state_dict: dict[str, Any]) -> th.Tensor:
+        """The current observations, shape (n_envs, obs_dim); infinite in a state that was saved without them."""
+        unknown = th.full((self.n_envs, self.perceiver.bounds.obs_dim), th.inf, dtype=th.float64)
+        observations: th.Tensor = state_dict.get("observations", unknown)
+        return observations
 
     @abstractmethod
     def _forget(self) -> None:
@@ -275,6 +305,10 @@ class Learner(ABC):
         checked_tensor(state, "entries", (n_envs, k, n_factors), th.int64, 0, n_actions - 1)
         checked_tensor(state, "held", (n_envs, n_factors), th.int64, UNDRAWN, n_actions - 1)
         checked_tensor(state, "lengths", (1 + n_envs,), th.float64, 0.0)
+        if "observations" in state:
+            shape = n_envs, self.perceiver.bounds.obs_dim
+            checked_tensor(state, "observations", shape, th.float64, finite=False)
+        checked_tensor(state, "forbidden", (n_envs, n_actions), th.bool)
         traces, rows = entry(state, "traces"), self.table.points()
         active = checked_points(traces, "points", n_points)
         if rows is not None and not th.isin(active, rows).all():

@@ -14,12 +14,12 @@ from sb3_knntd.common.interrupts import interrupts_held
 from sb3_knntd.common.random_stream import RandomStream
 from sb3_knntd.common.transitions import check_transition
 from sb3_knntd.kernels import td
-from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination, SelectionArguments
+from sb3_knntd.kernels.selection import GREEDY, UNDRAWN, Combination
 from sb3_knntd.kernels.state import EpisodeArrays, RandomRows, UpdateConfig, WorkArrays, make_state
 from sb3_knntd.kernels.traces import adopt, write_back
 from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, check_rates, update_rates
 from sb3_knntd.learners.growth import FLOAT32, as_rows
-from sb3_knntd.perception import Perceiver
+from sb3_knntd.perception import Experience, Perceiver
 from sb3_knntd.q_table import ActiveTraces, QTable
 
 
@@ -29,29 +29,36 @@ class Workplace:
 
     :param perceiver: with weights that the kernels implement
     :param table: the Q-table, on the CPU
-    :param selection: arguments of action selection
+    :param selector: selects actions
     :param n_envs: number of environments
     :param config: variant of the update
     :param traces: the eligibility traces; ``None`` for those of the table
     :param stream: rows of random numbers, shape (n_envs, 2, n_uniforms); ``None`` if none are needed
+    :param experience: where each step is recorded; ``None`` if none are made
+    :param greedy: whether to select greedily, the first of equal actions
     """
 
     def __init__(
         self,
         perceiver: Perceiver,
         table: QTable,
-        selection: SelectionArguments,
+        selector: ActionSelector,
         n_envs: int,
         config: UpdateConfig,
         traces: ActiveTraces | None = None,
         stream: RandomStream | None = None,
+        experience: Experience | None = None,
+        greedy: bool = False,
     ) -> None:
         self.perceiver = perceiver
         self.table = table
-        self.selection = selection
+        self.selector = selector
+        self.greedy = greedy
+        self.selection = selection = selector.kernel_arguments(greedy)
         self.config = config
         self.traces = traces
         self.stream = stream
+        self.experience = experience or Experience(perceiver.bounds.obs_dim)
         k, n_factors, n_actions = perceiver.search.n_neighbors, len(selection.factors) - 1, table.n_actions
         self.episodes = EpisodeArrays(
             indices=np.zeros((3, n_envs, k), np.int64),
@@ -60,8 +67,10 @@ class Workplace:
             actions=np.zeros((3, n_envs, selection.action_points.shape[1])),
             truncated=np.zeros(n_envs, np.bool_),
             last_observations=np.zeros((n_envs, perceiver.bounds.obs_dim)),
+            current_observations=np.full((n_envs, perceiver.bounds.obs_dim), np.inf),
             persistent=np.full((n_envs, n_factors), UNDRAWN),
             lengths=np.zeros(1 + n_envs),
+            forbidden=np.zeros((3, n_envs, n_actions), np.bool_),
         )
         self.work = WorkArrays(
             means=np.zeros(n_actions),
@@ -80,6 +89,7 @@ class Workplace:
         self.versions = self.perceiver.version, self.table.version
         perception = self.perceiver.arguments
         assert perception is not None
+        self.selection = self.selector.kernel_arguments(self.greedy)
         traces = self.traces or self.table.traces
         no_rows = RandomRows(np.empty((0, 0, 0, 0)), np.zeros(1, np.int64))
         random = no_rows if self.stream is None else RandomRows(self.stream.rows, self.stream.taken)
@@ -94,6 +104,7 @@ class Workplace:
             self.episodes,
             random,
             self.work,
+            self.experience.arrays(),
         )
         # numba does not support an interruption while it boxes or unboxes a state.
         with interrupts_held():
@@ -129,6 +140,7 @@ class CompiledLearner(Learner):
     :param stream: rows of random numbers, shape (n_envs, 2, selector.n_uniforms)
     :param n_envs: number of environments
     :param config: variant of the update
+    :param experience: where each step is recorded
     """
 
     def __init__(
@@ -139,11 +151,12 @@ class CompiledLearner(Learner):
         stream: RandomStream,
         n_envs: int,
         config: UpdateConfig,
+        experience: Experience,
     ) -> None:
-        super().__init__(perceiver, table, selector, n_envs, config)
+        super().__init__(perceiver, table, selector, n_envs, config, experience)
         self.stream = stream
         table.start_traces(n_envs)
-        self._workplace = Workplace(perceiver, table, selector.kernel_arguments(), n_envs, config, stream=stream)
+        self._workplace = Workplace(perceiver, table, selector, n_envs, config, stream=stream, experience=experience)
         self._prepare()
 
     def _prepare(self) -> None:
@@ -174,7 +187,7 @@ class CompiledLearner(Learner):
     def configure(self, selector: ActionSelector, config: UpdateConfig) -> None:
         super().configure(selector, config)
         with self.table.lock:
-            self._workplace.selection = selector.kernel_arguments()
+            self._workplace.selector = selector
             self._workplace.config = config
             self._bind()
 
@@ -190,6 +203,7 @@ class CompiledLearner(Learner):
             td.begin(self._workplace.state, seen, self.stream.next()[:, 0], exploration_rate)
         self._workplace.work.trace_bound[0] = 0.0
         self.in_episodes = True
+        self.rules_version = self.selector.rules.version
 
     def step(
         self,
@@ -246,7 +260,7 @@ class CompiledLearner(Learner):
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         rates = update_rates(learning_rate, trace_decay)
         columns = transitions.columns(self.selector, self.perceiver.bounds.obs_dim)
-        self._grow_for(transitions)
+        self.grow_for(transitions)
         n, k = len(columns), self.shape[1]
         before, after = (
             as_rows(np.asarray(array)).reshape(n, -1).astype(np.float64)
@@ -262,8 +276,7 @@ class CompiledLearner(Learner):
         with self.table.lock:
             own = ActiveTraces(self.table.n_actions, 1)
             write_back(self.table.arrays(), self.table.traces.arrays)
-            arguments = self.selector.kernel_arguments()
-            place = Workplace(self.perceiver, self.table, arguments, 1, self.config, traces=own)
+            place = Workplace(self.perceiver, self.table, self.selector, 1, self.config, traces=own)
             done, outcome = 0, td.OK
             try:
                 while done < n:
@@ -287,6 +300,7 @@ class CompiledLearner(Learner):
                     elif outcome != td.OK:
                         raise FloatingPointError(f"transition {done}: {DIVERGENCE}")
             finally:
+                self._record(transitions, done)
                 write_back(self.table.arrays(), own.arrays)
                 adopt(self.table.arrays(), self.table.traces.arrays)
                 self._workplace.work.value_bound[0] = np.inf
@@ -329,6 +343,8 @@ class CompiledLearner(Learner):
                 "entries": th.from_numpy(episodes.action_indices[td.CURRENT].copy()),
                 "held": th.from_numpy(episodes.persistent.copy()),
                 "lengths": th.from_numpy(episodes.lengths.copy()),
+                "observations": th.from_numpy(episodes.current_observations.copy()),
+                "forbidden": th.from_numpy(episodes.forbidden[td.CURRENT].copy()),
                 "traces": self.table.traces.state(),
             }
 
@@ -343,6 +359,8 @@ class CompiledLearner(Learner):
         episodes.action_indices[td.CURRENT] = state_dict["entries"].numpy()
         episodes.persistent[:] = state_dict["held"].numpy()
         episodes.lengths[:] = state_dict["lengths"].numpy()
+        episodes.current_observations[:] = self._observations_in(state_dict).numpy()
+        episodes.forbidden[td.CURRENT] = state_dict["forbidden"].numpy()
         # Sum in the order of the kernel, for the same rounding.
         actions = episodes.actions[td.CURRENT]
         actions[:] = 0.0
@@ -364,7 +382,7 @@ class GreedyReader:
 
     def __init__(self, perceiver: Perceiver, table: QTable, selector: ActionSelector) -> None:
         config = UpdateConfig(gamma=1.0, normalized=True, accumulating=False, reset_other_actions=False)
-        self._workplace = Workplace(perceiver, table, selector.kernel_arguments(greedy=True), 1, config)
+        self._workplace = Workplace(perceiver, table, selector, 1, config, greedy=True)
         self._workplace.episodes.persistent[:] = GREEDY
         self._uniforms = np.zeros(selector.n_uniforms)
 

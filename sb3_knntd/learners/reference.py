@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_knntd.actions.rules import masked
 from sb3_knntd.actions.selection import ActionSelector, Selection
 from sb3_knntd.common.checks import check_finite
 from sb3_knntd.common.random_stream import RandomStream
@@ -16,7 +17,7 @@ from sb3_knntd.kernels.selection import UNDRAWN, count_steps
 from sb3_knntd.kernels.state import UpdateConfig
 from sb3_knntd.kernels.traces import LARGEST_VALUE
 from sb3_knntd.learners.base import DIVERGENCE, Learner, Rates, Transitions, check_rates, update_rates
-from sb3_knntd.perception import Perceiver, Perception
+from sb3_knntd.perception import Experience, Perceiver, Perception
 from sb3_knntd.q_table import DenseTable, DenseTraces, OneStepTraces, Traces
 
 
@@ -30,6 +31,7 @@ class TorchLearner(Learner):
     :param stream: rows of random numbers, shape (n_envs, 2, selector.n_uniforms)
     :param n_envs: number of environments
     :param config: variant of the update
+    :param experience: where each step is recorded
     :param one_step: whether λ is always 0, so that no traces are stored
     """
 
@@ -43,9 +45,10 @@ class TorchLearner(Learner):
         stream: RandomStream,
         n_envs: int,
         config: UpdateConfig,
+        experience: Experience,
         one_step: bool = False,
     ) -> None:
-        super().__init__(perceiver, table, selector, n_envs, config)
+        super().__init__(perceiver, table, selector, n_envs, config, experience)
         self.stream = stream
         self.one_step = one_step
         self.traces = self._make_traces(n_envs)
@@ -55,8 +58,11 @@ class TorchLearner(Learner):
         self.action_indices = th.zeros(self.shape, dtype=th.int64, device=values.device)
         #: persistent actions, see :meth:`~sb3_knntd.actions.selection.ActionSelector.persist`
         self.persistent = th.full((n_envs, n_factors), UNDRAWN, dtype=th.int64, device=values.device)
+        #: the columns that the rules forbid in the current states
+        self.forbidden = th.zeros((n_envs, table.n_actions), dtype=th.bool, device=values.device)
         #: see :func:`~sb3_knntd.kernels.selection.count_steps`; on the CPU, like ``ended``
         self.lengths = np.zeros(1 + n_envs)
+        self._observations = th.full((n_envs, perceiver.bounds.obs_dim), th.inf, dtype=th.float64)
         self._actions = np.empty(0)
         self._sums = values.new_zeros(2)
         self._n_sums = 0
@@ -79,6 +85,7 @@ class TorchLearner(Learner):
 
     def begin(self, observations: np.ndarray, exploration_rate: float) -> None:
         check_finite("an observation", observations, range(self.n_envs))
+        self.rules_version = self.selector.rules.version
         uniforms = self.stream.next()[:, 0]
         self._grow(observations, {})
         self._follow_table()
@@ -86,7 +93,8 @@ class TorchLearner(Learner):
         self.lengths[1:] = 0.0
         self._persist(UNDRAWN, uniforms, exploration_rate)
         perception, selection = self._select(observations, uniforms, exploration_rate, self.persistent)
-        self._advance(perception, selection)
+        self._observations = self._tensor(observations).reshape(self.n_envs, -1)
+        self._advance(observations, perception, selection)
 
     def step(
         self,
@@ -129,7 +137,9 @@ class TorchLearner(Learner):
         self.table.visit(self.indices)
         self._sums += th.stack((errors.abs().sum(), value.sum()))
         self._n_sums += self.n_envs
-        self._advance(perception, selection)
+        before, self._observations = self._observations, self._tensor(observations).reshape(self.n_envs, -1)
+        self.experience.record(before, self._observations, self._tensor(rewards), over, self.perceiver.bounds)
+        self._advance(observations, perception, selection)
 
     def _update(
         self,
@@ -166,27 +176,28 @@ class TorchLearner(Learner):
     def update(self, transitions: Transitions, learning_rate: float, trace_decay: float) -> None:
         rates = update_rates(learning_rate, trace_decay)
         columns = transitions.columns(self.selector, self.perceiver.bounds.obs_dim)
-        self._grow_for(transitions)
+        self.grow_for(transitions)
         with self.table.lock:
             self._follow_table()
             traces = self._make_traces(1)
             goes_on = False
             for t in range(len(columns)):
                 goes_on = self._update_from(traces, transitions, th.from_numpy(columns[t]), t, goes_on, rates)
+            self._record(transitions, len(columns))
 
     def _update_from(
         self, traces: Traces, transitions: Transitions, column: th.Tensor, t: int, goes_on: bool, rates: Rates
     ) -> bool:
         """Learn from one transition; whether the next one continues it."""
         device = self.indices.device
-        rows, probabilities, indices = self._rows_at(transitions.observations[t])
-        next_rows, next_probabilities, _ = self._rows_at(transitions.next_observations[t])
+        rows, allowed, probabilities, indices = self._rows_at(transitions.observations[t])
+        _, next_rows, next_probabilities, _ = self._rows_at(transitions.next_observations[t])
         given = self.selector.given_value(rows, probabilities, column[None].to(device))
-        greedy = self.selector.greedy_value(rows, probabilities)
+        greedy = self.selector.greedy_value(allowed, probabilities)
         if goes_on and bool(given < greedy):
             traces.clear()
         action_indices = column.to(device).expand(1, rows.shape[1], len(column))
-        value = self.selector.value(rows, probabilities, action_indices)
+        value = self.selector.value(rows, probabilities, action_indices, allowed)
         target = self.selector.greedy_value(next_rows, next_probabilities) * float(not transitions.terminated[t])
         errors = float(transitions.rewards[t]) + self.config.gamma * target - value
         over = th.tensor([bool(transitions.ended[t])], device=device)
@@ -194,10 +205,13 @@ class TorchLearner(Learner):
         self.table.visit(indices)
         return not transitions.ended[t]
 
-    def _rows_at(self, observation: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        perception = self.perceiver(self._tensor(np.asarray(observation)[None]))
+    def _rows_at(self, observation: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+        """The rows of the neighbours, the same without forbidden actions, the probabilities and the neighbours."""
+        seen = self._tensor(np.asarray(observation)[None])
+        perception = self.perceiver(seen)
         rows = self.table.rows(perception.indices)
-        return rows, perception.probabilities.to(rows.dtype), perception.indices
+        probabilities = perception.probabilities.to(rows.dtype)
+        return rows, self.selector.rules.mask(rows, probabilities, seen), probabilities, perception.indices
 
     def _follow_table(self) -> None:
         """Make new traces if the number of rows of the table has changed; if it has grown, the old ones are kept."""
@@ -228,6 +242,8 @@ class TorchLearner(Learner):
             "entries": self.action_indices.cpu(),
             "held": self.persistent.cpu(),
             "lengths": th.from_numpy(self.lengths.copy()),
+            "observations": self._observations.double().cpu(),
+            "forbidden": self.forbidden.cpu(),
             "traces": self.traces.state(),
         }
 
@@ -241,6 +257,8 @@ class TorchLearner(Learner):
         self.action_indices.copy_(state_dict["entries"])
         self.persistent.copy_(state_dict["held"])
         self.lengths[:] = state_dict["lengths"].numpy()
+        self._observations = self._observations_in(state_dict).to(self.indices.device)
+        self.forbidden.copy_(state_dict["forbidden"])
         self.traces.set_state(state_dict["traces"])
         actions = self.selector.actions_of(self.action_indices, self.probabilities)
         self._actions = actions.cpu().numpy()
@@ -253,18 +271,23 @@ class TorchLearner(Learner):
     def _select(
         self, observations: np.ndarray, uniforms: np.ndarray, rate: float, persistent: th.Tensor
     ) -> tuple[Perception, Selection]:
-        perception = self.perceiver(self._tensor(observations))
+        seen = self._tensor(observations)
+        perception = self.perceiver(seen)
         probabilities = perception.probabilities.to(self.table.values.dtype)
-        rows = self.table.rows(perception.indices)
+        rows = self.selector.rules.mask(self.table.rows(perception.indices), probabilities, seen)
         selection = self.selector.select(rows, probabilities, self._tensor(uniforms), rate, persistent)
         return Perception(perception.indices, probabilities), selection
 
     def _value(self) -> th.Tensor:
         """Q(s, a) at the current state and action of each environment, shape (n_envs,)."""
-        return self.selector.value(self.table.rows(self.indices), self.probabilities, self.action_indices)
+        rows = self.table.rows(self.indices)
+        allowed = masked(rows, self.probabilities, self.forbidden) if len(self.selector.rules) else rows
+        return self.selector.value(rows, self.probabilities, self.action_indices, allowed)
 
-    def _advance(self, perception: Perception, selection: Selection) -> None:
+    def _advance(self, observations: np.ndarray, perception: Perception, selection: Selection) -> None:
         self.in_episodes = True
+        if len(self.selector.rules):
+            self.forbidden.copy_(self.selector.rules.forbidden(self._tensor(observations)))
         self.indices.copy_(perception.indices)
         self.probabilities.copy_(perception.probabilities)
         self.action_indices.copy_(selection.action_indices)

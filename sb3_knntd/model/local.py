@@ -13,9 +13,10 @@ from sb3_knntd.kernels.local_model import FitConfig, ModelArrays, TransitionArra
 from sb3_knntd.model.buffer import TransitionBuffer
 from sb3_knntd.perception.bounds import Bounds
 
-#: A list holds this many times the transitions that set the bandwidth, and these are this many times the inputs of a fit.
-LIST_FACTOR = 3
+#: Number of transitions that set the bandwidth of a fit, for each of its inputs.
 FITTED_PER_INPUT = 2
+#: A list holds this many times as many.
+LIST_FACTOR = 3
 #: An action is known at a point if it was taken within this distance, in spacings.
 REACH = 2.5
 #: Half of the range of an action dimension counts as this distance, in spacings.

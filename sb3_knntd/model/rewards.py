@@ -29,7 +29,8 @@ def compiled_reward(
         return learned_reward
     if not callable(function):
         raise ValueError(
-            f"reward_function must be a function of (observation, action, next_observation), or None; got {function!r:.100}"
+            "reward_function must be a function of (observation, action, next_observation), or None; got "
+            f"{function!r:.100}"
         )
     if not jit.AVAILABLE:
         raise ValueError(f"reward_function must be compiled, and numba cannot be used: {jit.REASON}")
@@ -38,13 +39,13 @@ def compiled_reward(
     inner = function if hasattr(function, "py_func") else numba.njit(function)
     if isinstance(action_space, spaces.Discrete):
 
-        def reward(observation, action, next_observation):
+        def reward(observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray) -> float:
             return float(inner(observation, int(action[0]), next_observation))
 
         action = np.array([float(action_space.start)])
     else:
 
-        def reward(observation, action, next_observation):
+        def reward(observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray) -> float:
             return float(inner(observation, action, next_observation))
 
         action = np.asarray(action_space.sample(), dtype=np.float64).reshape(-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_knntd.common.checks import check_numbers, shown
+from sb3_knntd.common.checks import check_integer, check_numbers, shown
 from sb3_knntd.common.state_checks import checked_tensor
 
 #: A larger bound counts as no bound: no sensor spans such a range, and no lattice resolves it.
@@ -42,9 +43,10 @@ class Bounds(nn.Module):
     Affine map of each observation dimension onto [-1, 1] (eq. 4 of the paper). Observations outside the bounds are
     mapped to values outside [-1, 1], clipped to ±10,000.
 
-    A dimension whose bounds are infinite, larger than 1e10 or empty (low >= high) is *open*: its range is [-1, 1] until
-    :meth:`measure` is called, and then that of the observations, widened by a quarter on each side. *Adaptive* bounds
-    are open in all dimensions, and :meth:`widen` moves them when an observation lies outside, up to the bounds given.
+    A dimension is *open* if one of its bounds is infinite, NaN or larger than 1e10, or if it is empty (low >= high).
+    Its range is [-1, 1] until :meth:`measure` is called, and then that of the observations, widened by a quarter on
+    each side; a finite bound stays where it is. *Adaptive* bounds are open in all dimensions, and :meth:`widen` moves
+    them when an observation lies outside, up to the bounds given.
 
     :param low: lower bounds, shape (obs_dim,), observation units
     :param high: upper bounds, shape (obs_dim,), observation units
@@ -65,13 +67,15 @@ class Bounds(nn.Module):
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         #: number of observation dimensions
         self.obs_dim = len(low)
-        sensible = (np.abs(low) <= LARGEST_SENSIBLE_BOUND) & (np.abs(high) <= LARGEST_SENSIBLE_BOUND) & (low < high)
-        is_open = ~sensible | adaptive
+        empty = low >= high
+        low_is_known = (np.abs(low) <= LARGEST_SENSIBLE_BOUND) & ~empty
+        high_is_known = (np.abs(high) <= LARGEST_SENSIBLE_BOUND) & ~empty
+        is_open = ~(low_is_known & high_is_known) | adaptive
         self.register_buffer("low", th.from_numpy(np.where(is_open, -1.0, low)))
         self.register_buffer("high", th.from_numpy(np.where(is_open, 1.0, high)))
         self.register_buffer("open", th.from_numpy(is_open))
-        self.register_buffer("lowest", th.from_numpy(np.where(sensible, low, -np.inf)), persistent=False)
-        self.register_buffer("highest", th.from_numpy(np.where(sensible, high, np.inf)), persistent=False)
+        self.register_buffer("lowest", th.from_numpy(np.where(low_is_known, low, -np.inf)), persistent=False)
+        self.register_buffer("highest", th.from_numpy(np.where(high_is_known, high, np.inf)), persistent=False)
         self.register_buffer("seen_low", th.full_like(self.low, th.inf))
         self.register_buffer("seen_high", th.full_like(self.low, -th.inf))
 
@@ -102,10 +106,17 @@ class Bounds(nn.Module):
         width = self.seen_high - self.seen_low
         # A dimension that was constant so far gets one unit on each side.
         margin = th.where(width > 0, MARGIN * width, 1.0)
-        self._set(
-            th.where(self.open, self.seen_low - margin, self.low),
-            th.where(self.open, self.seen_high + margin, self.high),
-        )
+        low = th.where(self.open, self.seen_low - margin, self.low)
+        high = th.where(self.open, self.seen_high + margin, self.high)
+        if not self.adaptive:
+            low = th.where(self.lowest.isfinite(), self.lowest, low)
+            high = th.where(self.highest.isfinite(), self.highest, high)
+            # All observations lie beyond the bound that is known.
+            low, high = (
+                th.where((low >= high) & self.lowest.isinf(), high - 1.0, low),
+                th.where((low >= high) & self.highest.isinf(), low + 1.0, high),
+            )
+        self._set(low, high)
 
     def widen(self, observations: th.Tensor) -> None:
         """
@@ -120,6 +131,19 @@ class Bounds(nn.Module):
             th.where(lowest < self.low, lowest - margin, self.low),
             th.where(highest > self.high, highest + margin, self.high),
         )
+
+    def take_over(self, before: Bounds) -> None:
+        """
+        Take the range of the open dimensions from other bounds.
+
+        :param before: bounds of the same dimensions
+        """
+        self.seen_low.copy_(before.seen_low)
+        self.seen_high.copy_(before.seen_high)
+        ends_stay = not self.adaptive
+        low = th.where(self.lowest.isfinite() & ends_stay, self.lowest, before.low)
+        high = th.where(self.highest.isfinite() & ends_stay, self.highest, before.high)
+        self._set(th.where(self.open, low, self.low), th.where(self.open, high, self.high))
 
     def reach(self) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -212,51 +236,79 @@ def make_bounds(
 ) -> Bounds:
     """
     :param bounds: ``None`` for the bounds of the space, ``"adaptive"`` to follow the observations within the bounds of
-        the space, or a pair (low, high) of arrays of shape (obs_dim,) in observation units
+        the space, a pair (low, high) of arrays of shape (obs_dim,) in observation units, or a dict of some dimensions
+        and their (low, high), the others as with ``None``. A bound that is infinite or NaN has to be measured
     :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
     :param from_space: whether the bounds of the space hold. They do not for an environment wrapped in VecNormalize;
         then all dimensions are open unless ``bounds`` are given
     :param visited: whether the open dimensions have the range that was visited, see :class:`VisitedBounds`
     :return: the bounds
-    :raises ValueError: if ``bounds`` has another form, is not finite, or low >= high somewhere
+    :raises ValueError: if ``bounds`` has another form, is larger than 1e10, or low >= high somewhere
     """
     kind = VisitedBounds if visited else Bounds
     low, high = _bounds_of(observation_space)
-    if bounds is None and from_space:
-        return kind(low, high)
-    unbounded = np.full_like(low, -np.inf), np.full_like(high, np.inf)
+    # A space with one bound says little about the range: both are measured.
+    sensible = (np.abs(low) <= LARGEST_SENSIBLE_BOUND) & (np.abs(high) <= LARGEST_SENSIBLE_BOUND) & from_space
+    low, high = np.where(sensible, low, -np.inf), np.where(sensible, high, np.inf)
     if bounds is None:
-        return kind(*unbounded)
+        return kind(low, high)
     if not isinstance(observation_space, spaces.Box):
         raise ValueError(
             f"bounds must be None for a {type(observation_space).__name__} observation space, whose states are "
             f"the points; got {shown(bounds)}"
         )
     if isinstance(bounds, str) and bounds == "adaptive":
-        return kind(*((low, high) if from_space else unbounded), adaptive=True)
+        return kind(low, high, adaptive=True)
+    return kind(*check_box("bounds", bounds, low, high, "None, 'adaptive', or "))
+
+
+def check_box(
+    name: str, value: Any, low: np.ndarray, high: np.ndarray, also: str = "", thin: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param name: name of the argument
+    :param value: a pair (low, high) of arrays of shape (n_dims,), or a dict of some dimensions and their (low, high).
+        A bound may be infinite or NaN
+    :param low: lower bounds of the dimensions that a dict does not name, shape (n_dims,)
+    :param high: upper bounds of them, shape (n_dims,)
+    :param also: what else the argument may be, for the message
+    :param thin: whether low may equal high
+    :return: the lower and the upper bounds, shape (n_dims,) each
+    :raises ValueError: if ``value`` has another form, a bound is finite and larger than 1e10, or low is not below high
+    """
+    n_dims = len(low)
+    forms = f"a pair (low, high) of {n_dims} numbers each, or a dict such as {{{n_dims - 1}: (-3.0, 3.0)}}"
     try:
-        given_low, given_high = (check_numbers("bounds", bound) for bound in bounds)
+        if isinstance(value, Mapping):
+            given_low, given_high = low.copy(), high.copy()
+            for key, pair in value.items():
+                # JSON turns the keys of a saved dict into text.
+                dimension = check_integer(
+                    f"{name}: a dimension", int(key) if isinstance(key, str) else key, 0, n_dims - 1
+                )
+                given_low[dimension], given_high[dimension] = check_numbers(name, pair)
+        else:
+            given_low, given_high = (check_numbers(name, bound) for bound in value)
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"bounds must be None, 'adaptive', or a pair (low, high) of arrays of numbers; got {shown(bounds)}"
-        ) from error
-    for name, given in (("low", given_low), ("high", given_high)):
-        if given.shape != low.shape:
+        reason = f" ({error})" if isinstance(value, Mapping) else ""
+        raise ValueError(f"{name} must be {also}{forms}; got {shown(value)}{reason}") from error
+    for end, given in (("low", given_low), ("high", given_high)):
+        if given.shape != (n_dims,):
             raise ValueError(
-                f"bounds: {name} must have shape {low.shape}, one number for each observation dimension; "
-                f"got shape {given.shape}"
+                f"{name}: {end} must have shape {(n_dims,)}, one number for each dimension; got shape {given.shape}"
             )
-        if not np.all(np.abs(given) <= LARGEST_SENSIBLE_BOUND):
+        if np.any(np.isfinite(given) & (np.abs(given) > LARGEST_SENSIBLE_BOUND)):
             raise ValueError(
-                f"bounds: {name} must be finite and at most {LARGEST_SENSIBLE_BOUND:g} in size; got {given}"
+                f"{name}: {end} must be at most {LARGEST_SENSIBLE_BOUND:g} in size, or infinite or NaN; got {given}"
             )
-    if not np.all(given_low < given_high):
-        dimension = int(np.argmax(given_low >= given_high))
+    wrong = given_low > given_high if thin else given_low >= given_high
+    if wrong.any():
+        dimension = int(np.argmax(wrong))
         raise ValueError(
-            f"bounds: low must be below high in every dimension; in dimension {dimension} low is "
-            f"{given_low[dimension]:g} and high is {given_high[dimension]:g}"
+            f"{name}: low must be {'at most' if thin else 'below'} high in every dimension; in dimension {dimension} "
+            f"low is {given_low[dimension]:g} and high is {given_high[dimension]:g}"
         )
-    return kind(given_low, given_high)
+    return given_low, given_high
 
 
 def _bounds_of(observation_space: spaces.Space[Any]) -> tuple[np.ndarray, np.ndarray]:

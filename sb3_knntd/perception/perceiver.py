@@ -15,7 +15,7 @@ from sb3_knntd.perception.bounds import FARTHEST, Bounds
 from sb3_knntd.perception.growing import GrowingPoints
 from sb3_knntd.perception.points import Lattice, Points, Scattered
 from sb3_knntd.perception.search import Neighbors, Search
-from sb3_knntd.perception.search.base import nearest_by_tensors
+from sb3_knntd.perception.search.tensors import nearest_by_tensors
 from sb3_knntd.perception.weights import KernelWeights, Weights
 
 
@@ -230,8 +230,11 @@ class Perceiver(nn.Module):
         :return: their perceptions
         """
         if is_traced():
-            places = self.points.coordinates(self.bounds)
-            indices, squared_distances = nearest_by_tensors(scaled, places, self.search.n_neighbors)
+            indices, squared_distances = nearest_by_tensors(scaled, self.points, self.bounds, self.search.n_neighbors)
+            if not isinstance(self.points, GrowingPoints):
+                weights = self.weights(squared_distances)
+                # Added one after the other, as in the kernels, so that both are rounded in the same way.
+                return Perception(indices, weights / weights.cumsum(dim=1)[:, -1:])
         else:
             indices, squared_distances = self.search.query(scaled)
         return Perception(indices, self.weigh(squared_distances))

@@ -76,13 +76,13 @@ class Lattice(Points):
             "give fewer points a dimension, or map a dimension of so many states to fewer",
         )
         self.axes = [np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1) for n in self.shape]
-        self._axes = [th.from_numpy(axis) for axis in self.axes]
+        self.axis_tensors = [th.from_numpy(axis) for axis in self.axes]
 
     def coordinates(self, bounds: Bounds, indices: th.Tensor | None = None) -> th.Tensor:
         device = bounds.low.device
         rest = th.arange(self.n_points, device=device) if indices is None else indices
         columns = []
-        for axis, count in zip(reversed(self._axes), reversed(self.shape), strict=True):
+        for axis, count in zip(reversed(self.axis_tensors), reversed(self.shape), strict=True):
             columns.append(axis.to(device)[rest % count])
             rest = rest // count
         return th.stack(columns[::-1], dim=1)

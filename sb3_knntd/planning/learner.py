@@ -43,7 +43,7 @@ class DynaLearner(Learner):
     def __init__(
         self, policy: KNNPolicy, planner: Planner, stream: RandomStream, n_envs: int, config: UpdateConfig
     ) -> None:
-        super().__init__(policy.perceiver, policy.table, policy.selector, n_envs, config)
+        super().__init__(policy.perceiver, policy.table, policy.selector, n_envs, config, policy.experience)
         self.policy, self.planner, self._stream = policy, planner, stream
         obs_dim = policy.perceiver.bounds.obs_dim
         self._is_box = policy.columns.points.shape[1] > 0
@@ -85,6 +85,7 @@ class DynaLearner(Learner):
         for row in rows:
             self.planner.begin(row)
         self.in_episodes = True
+        self.rules_version = self.selector.rules.version
         self._select()
 
     def step(
@@ -128,6 +129,8 @@ class DynaLearner(Learner):
                 # Where it ended is not known: that it ended is.
                 next_rows[env] = self._observations[env]
             self.planner.add(self._observations[env], actions[env], float(rewards[env]), next_rows[env], terminated)
+        before, after, seen_rewards, any_end = map(th.as_tensor, (self._observations, next_rows, rewards, ended))
+        self.experience.record(before, after, seen_rewards, any_end, self.perceiver.bounds)
         self._observations[:] = rows
         self._rest -= 1
         for env in np.flatnonzero(ended).tolist():
@@ -136,13 +139,18 @@ class DynaLearner(Learner):
         self._since_plan += self.n_envs
         self._steps_since_summary += self.n_envs
         if self._since_plan >= PLAN_EVERY or ended.any():
-            self._plan()
+            self.plan(self._since_plan)
         self._select()
 
-    def _plan(self) -> None:
+    def plan(self, n_steps: int) -> None:
+        """
+        Plan with what has been learned.
+
+        :param n_steps: the number of steps of the environment that the simulated ones are counted by
+        """
         started = time.perf_counter()
         seed = int(self._stream.next().reshape(-1)[0] * 2**53)
-        self.planner.plan(self._since_plan, seed)
+        self.planner.plan(n_steps, seed)
         self._since_plan = 0
         self._planning_seconds += time.perf_counter() - started
 
@@ -163,6 +171,7 @@ class DynaLearner(Learner):
                 each[0, : len(source)].numpy() for each in self.perceiver.perceive_one(observation)
             )
             values[env] = probabilities @ source[indices]
+        values[self.selector.rules.forbidden(th.from_numpy(self._observations)).numpy()] = -np.inf
         self._columns[:] = pick_best(values, uniforms[:, 1])
         if self._is_box:
             self._vectors[:] = self.policy.columns.points[self._columns]
@@ -172,9 +181,9 @@ class DynaLearner(Learner):
                 self._vectors[greedy] = self.selector.peak(th.from_numpy(values[greedy]), best).numpy()  # type: ignore[attr-defined]
 
     def _select_random(self, uniforms: np.ndarray) -> None:
-        due = self._rest <= 0
-        drawn = (uniforms[:, 2] * self.table.n_actions).astype(np.int64)
-        self._columns[due] = drawn[due]
+        forbidden = self.selector.rules.forbidden(th.from_numpy(self._observations)).numpy()
+        due = (self._rest <= 0) | forbidden[np.arange(self.n_envs), self._columns]
+        self._columns[due] = pick_best(np.where(forbidden, -np.inf, 0.0), uniforms[:, 2])[due]
         self._rest[due] = 1 + (uniforms[due, 3] * LONGEST_RANDOM_HOLD).astype(np.int64)
         self._vectors[:] = self.policy.columns.points[self._columns]
 
@@ -188,6 +197,7 @@ class DynaLearner(Learner):
         actions = self.scaled_actions(
             np.asarray(transitions.actions).reshape(n, -1) if self._is_box else transitions.actions
         )
+        self._record(transitions, n)
         is_first = True
         for i in range(n):
             if is_first:
@@ -198,7 +208,7 @@ class DynaLearner(Learner):
             is_first = bool(transitions.ended[i])
             self._since_plan += 1
             if self._since_plan >= PLAN_EVERY:
-                self._plan()
+                self.plan(self._since_plan)
 
     # -------------------------------------------------------- logging, saving
 

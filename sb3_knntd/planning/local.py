@@ -9,6 +9,7 @@ import torch as th
 
 from sb3_knntd.common.arrays import load_arrays, reserve, saved_arrays
 from sb3_knntd.common.state_checks import checked_integer, checked_tensor, entry
+from sb3_knntd.dyna_policies import SpacedPolicy
 from sb3_knntd.kernels import planning as kernels
 from sb3_knntd.kernels.local_model import OUTCOME, nearest_point
 from sb3_knntd.kernels.planning import OutcomeArrays, PlanConfig, SimulationConfig
@@ -16,7 +17,7 @@ from sb3_knntd.learners.growth import grow, lay_anew
 from sb3_knntd.model import LocalModel, Prediction, TransitionBuffer
 from sb3_knntd.perception import GrowingPoints
 from sb3_knntd.planning.base import TOLERANCE, Planner, PlanSettings
-from sb3_knntd.policies import KNNPolicy
+from sb3_knntd.q_table import DenseTable
 
 #: Number of transitions before the points are laid.
 FIRST_PLAN = 25
@@ -67,7 +68,7 @@ class LocalPlanner(Planner):
 
     def __init__(
         self,
-        policy: KNNPolicy,
+        policy: SpacedPolicy,
         buffer: TransitionBuffer,
         action_points: np.ndarray,
         settings: PlanSettings,
@@ -138,6 +139,7 @@ class LocalPlanner(Planner):
         self.model.scale(transition)
         self._compare(transition)
         self.model.enter(transition)
+        self._visit(self.model.data.states[transition])
         self._cover(next_observation[None], may_add=not terminated)
 
     def _in_units(self, action: np.ndarray) -> np.ndarray:
@@ -146,7 +148,15 @@ class LocalPlanner(Planner):
             in_units: np.ndarray = self._actions[int(action[0])]
             return in_units
         low, high = self._actions.min(axis=0), self._actions.max(axis=0)
-        return low + 0.5 * (action + 1.0) * (high - low)
+        scaled: np.ndarray = low + 0.5 * (action + 1.0) * (high - low)
+        return scaled
+
+    def _visit(self, state: np.ndarray) -> None:
+        """Count a step at the nearest point."""
+        table = self.policy.table
+        assert isinstance(table, DenseTable)
+        point, _ = nearest_point(state, self.model.arrays.points, self.model.n_points)
+        table.visit(th.tensor([point], device=table.values.device))
 
     def _compare(self, transition: int) -> None:
         """Record how far a new transition is from what the model expects."""
@@ -214,9 +224,9 @@ class LocalPlanner(Planner):
     def _publish(self) -> None:
         """Write the values into the table."""
         table, n = self.policy.table, self.model.n_points
+        assert isinstance(table, DenseTable)
         with table.lock:
             table.values[:n] = th.from_numpy(self.values.simulated[:n]).to(table.values)
-            table.visit(th.from_numpy(np.flatnonzero(self.known.any(axis=1))).to(table.values.device))
 
     # ---------------------------------------------------------------- planning
 

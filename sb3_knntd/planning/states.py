@@ -13,6 +13,7 @@ from sb3_knntd.kernels.planning import OutcomeArrays
 from sb3_knntd.model import Prediction
 from sb3_knntd.planning.base import TOLERANCE, Planner, PlanSettings
 from sb3_knntd.policies import KNNPolicy
+from sb3_knntd.q_table import DenseTable
 
 #: Largest number of sweeps of a plan: the next one goes on from there.
 MOST_SWEEPS = 100
@@ -63,7 +64,10 @@ class StatePlanner(Planner):
         self, observation: np.ndarray, action: np.ndarray, reward: float, next_observation: np.ndarray, terminated: bool
     ) -> None:
         self.rewards.add(reward, terminated)
+        table = self.policy.table
+        assert isinstance(table, DenseTable)
         at = self._state(observation), self._column(action)
+        table.visit(th.tensor([at[0]], device=table.values.device))
         self._tried[at] += 1.0
         self._reward_sums[at] += reward
         if terminated:
@@ -72,9 +76,8 @@ class StatePlanner(Planner):
         successor, counts, successors = self._state(next_observation), self._counts[at], self._successors[at]
         places = np.flatnonzero((successors == successor) | (counts == 0.0))
         if not len(places):
-            self._counts, self._successors = (
-                np.concatenate((array, np.zeros_like(array)), axis=2) for array in (self._counts, self._successors)
-            )
+            self._counts = np.concatenate((self._counts, np.zeros_like(self._counts)), axis=2)
+            self._successors = np.concatenate((self._successors, np.zeros_like(self._successors)), axis=2)
             places = np.array([len(successors)])
         self._successors[(*at, places[0])] = successor
         self._counts[(*at, places[0])] += 1.0
@@ -126,9 +129,9 @@ class StatePlanner(Planner):
         lowest = np.where(known, self._values, np.inf).min(axis=1, keepdims=True)
         published = np.where(known, self._values, np.where(np.isfinite(lowest), lowest, 0.0))
         table = self.policy.table
+        assert isinstance(table, DenseTable)
         with table.lock:
             table.values[:] = th.from_numpy(published).to(table.values)
-            table.visit(th.from_numpy(np.flatnonzero(known.any(axis=1))).to(table.values.device))
 
     def predict(self, observation: np.ndarray, action: np.ndarray) -> Prediction:
         at = self._state(observation), self._column(action)

@@ -15,7 +15,7 @@ from sb3_knntd.plots.grids import (
     value_grid,
 )
 from sb3_knntd.plots.model_maps import Rollout, plot_model_points, plot_rollout, roll_out
-from sb3_knntd.plots.names import NAMES, Names, check_names, names_for
+from sb3_knntd.plots.names import NAMES, Names, check_names, names_for, names_in
 from sb3_knntd.plots.value_maps import (
     MOST_NAMED_ACTIONS,
     caption_of,
@@ -46,6 +46,7 @@ __all__ = [
     "count_panels",
     "figure_of",
     "names_for",
+    "names_in",
     "new_figure",
     "plot_learning_curve",
     "plot_model_points",

@@ -9,9 +9,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_knntd.actions.selection import mean_rows
-from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.common.checks import check_integer, check_number, shown
+from sb3_knntd.policies import TableModel
 
 #: The largest resolution of a grid; figures have fewer pixels.
 FINEST = 4096
@@ -76,7 +75,7 @@ def check_fixed(fixed: Any) -> dict[int, float] | None:
 
 
 def value_grid(
-    model: KNNAlgorithm,
+    model: TableModel,
     dims: tuple[int, int] = (0, 1),
     fixed: Mapping[int, float] | None = None,
     resolution: int = 120,
@@ -120,7 +119,7 @@ def value_grid(
     )
 
 
-def telling_dims(model: KNNAlgorithm, resolution: int = 60) -> tuple[int, int]:
+def telling_dims(model: TableModel, resolution: int = 60) -> tuple[int, int]:
     """
     Choose the two dimensions along which the value changes most, with the others fixed in the middle of their range.
 
@@ -141,7 +140,7 @@ def telling_dims(model: KNNAlgorithm, resolution: int = 60) -> tuple[int, int]:
 
 
 def _check_view(
-    model: KNNAlgorithm, dims: tuple[int, int], fixed: Mapping[int, float] | None, resolution: int, average: bool
+    model: TableModel, dims: tuple[int, int], fixed: Mapping[int, float] | None, resolution: int, average: bool
 ) -> tuple[dict[int, float], tuple[int, ...]]:
     """Check the arguments of :func:`value_grid`; the values of the fixed dimensions, and the averaged dimensions."""
     space = model.observation_space
@@ -171,20 +170,21 @@ class _Reading(NamedTuple):
     learned: np.ndarray
 
 
-def _read(model: KNNAlgorithm, observations: np.ndarray) -> _Reading:
+def _read(model: TableModel, observations: np.ndarray) -> _Reading:
     batches = np.array_split(observations, -(-len(observations) // BATCH))
     return _Reading(*map(np.concatenate, zip(*(_read_batch(model, batch) for batch in batches), strict=True)))
 
 
-def _read_batch(model: KNNAlgorithm, observations: np.ndarray) -> _Reading:
+def _read_batch(model: TableModel, observations: np.ndarray) -> _Reading:
     policy = model.policy
     with th.no_grad():
         rows, probabilities = policy.perceived_rows(observations)
-        q_values = mean_rows(rows, probabilities)
+        q_values = policy.q_values(observations)
         selector = policy.selector
         values = selector.greedy_value(rows, probabilities)
         actions = selector.greedy_actions(rows, probabilities).cpu().numpy()
-        learned = (rows != model.initial_value).flatten(1).any(dim=1)
+        # Forbidden actions are -inf in these rows, whether they have been learned or not.
+        learned = ((rows != policy.table.initial_value) & rows.isfinite()).flatten(1).any(dim=1)
     return _Reading(q_values.cpu().numpy(), values.cpu().numpy(), actions, learned.cpu().numpy())
 
 
@@ -217,6 +217,6 @@ def _join(readings: Sequence[_Reading], n_actions: int) -> _Reading:
     return _Reading((counts[..., None] * q_values).sum(axis=0), (counts * values).sum(axis=0), joined, anywhere)
 
 
-def _range(model: KNNAlgorithm) -> tuple[np.ndarray, np.ndarray]:
+def _range(model: TableModel) -> tuple[np.ndarray, np.ndarray]:
     bounds = model.policy.perceiver.bounds
     return bounds.low.cpu().numpy(), bounds.high.cpu().numpy()

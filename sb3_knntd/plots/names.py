@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.common.checks import shown
+from sb3_knntd.policies import TableModel
 
 
 class Names(NamedTuple):
@@ -56,9 +56,9 @@ def check_names(names: Any) -> Names | None:
     return checked
 
 
-def names_for(model: KNNAlgorithm, names: Names | None = None) -> Names:
+def names_for(model: TableModel, names: Names | None = None) -> Names:
     """
-    :param model: a model with Box observations
+    :param model: any model
     :param names: names given by the user
     :return: the given names; by default those of the model's environment in ``NAMES``, or numbers if it is not there
     :raises ValueError: if ``names`` does not fit the model's spaces
@@ -72,29 +72,39 @@ def names_for(model: KNNAlgorithm, names: Names | None = None) -> Names:
     return names or _names_of(model) or _numbered(model)
 
 
-def _names_of(model: KNNAlgorithm) -> Names | None:
-    env = model.get_env()
-    spec = None if env is None else env.get_attr("spec", 0)[0]
-    names = None if spec is None else NAMES.get(spec.id)
-    # A wrapper may have changed the spaces.
+def names_in(env_id: str, model: TableModel) -> Names | None:
+    """
+    :param env_id: gymnasium id of the environment that the model was trained on
+    :param model: any model
+    :return: the names in ``NAMES``; ``None`` if there are none, or a wrapper has changed the spaces
+    """
+    names = NAMES.get(env_id)
     return names if names is not None and _fit(names, model) else None
 
 
-def _fit(names: Names, model: KNNAlgorithm) -> bool:
-    return model.observation_space.shape == (len(names.observations),) and len(names.actions) == _count_actions(model)
+def _names_of(model: TableModel) -> Names | None:
+    env = model.get_env()
+    spec = None if env is None else env.get_attr("spec", 0)[0]
+    return None if spec is None else names_in(spec.id, model)
 
 
-def _count_actions(model: KNNAlgorithm) -> int:
+def _fit(names: Names, model: TableModel) -> bool:
+    n_dims = model.policy.perceiver.bounds.obs_dim
+    return len(names.observations) == n_dims and len(names.actions) == _count_actions(model)
+
+
+def _count_actions(model: TableModel) -> int:
     """Number of actions, or of action dimensions."""
     space = model.action_space
     return int(space.n) if isinstance(space, spaces.Discrete) else int(np.prod(space.shape or ()))
 
 
-def _numbered(model: KNNAlgorithm) -> Names:
-    assert isinstance(model.observation_space, spaces.Box)
+def _numbered(model: TableModel) -> Names:
     space, n_actions = model.action_space, _count_actions(model)
     if isinstance(space, spaces.Discrete):
         actions = tuple(f"action {number}" for number in range(space.start, space.start + n_actions))
     else:
         actions = tuple(f"action[{dim}]" for dim in range(n_actions))
-    return Names(tuple(f"observation[{dim}]" for dim in range(model.observation_space.shape[0])), actions)
+    if isinstance(model.observation_space, spaces.Discrete):
+        return Names(("state",), actions)
+    return Names(tuple(f"observation[{dim}]" for dim in range(model.policy.perceiver.bounds.obs_dim)), actions)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium import spaces
 
-from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.plots.figures import UNLEARNED_COLOR, figure_of, new_figure
 from sb3_knntd.plots.grids import ValueGrid, value_grid
 from sb3_knntd.plots.names import Names, names_for
+from sb3_knntd.policies import TableModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +22,7 @@ MOST_NAMED_ACTIONS = 10
 
 
 def plot_value_function(
-    model: KNNAlgorithm,
+    model: TableModel,
     dims: tuple[int, int] = (0, 1),
     fixed: Mapping[int, float] | None = None,
     resolution: int = 120,
@@ -111,7 +111,7 @@ def plot_visits(counts: np.ndarray, extent: tuple[float, float, float, float], a
     return axes
 
 
-def plot_points(model: KNNAlgorithm, dims: tuple[int, int], axes: Axes) -> Axes:
+def plot_points(model: TableModel, dims: tuple[int, int], axes: Axes) -> Axes:
     """
     Plot the perception points as dots on top of the axes' content, those of all places in the other dimensions.
 
@@ -154,7 +154,7 @@ def plot_routes(routes: Sequence[np.ndarray], dims: tuple[int, int], axes: Axes)
     return axes
 
 
-def count_panels(model: KNNAlgorithm) -> int:
+def count_panels(model: TableModel) -> int:
     """
     :param model: any model
     :return: number of axes that :func:`plot_value_function` draws on: one for the value and one for the action, with

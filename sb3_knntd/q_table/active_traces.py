@@ -73,6 +73,14 @@ class ActiveTraces:
         """Drop all traces, and the values of the entries with a trace."""
         self.arrays = self._empty(SMALLEST_CAPACITY)
 
+    def snapshot(self) -> bytes:
+        """
+        :return: what the values of the entries with a trace follow from; it differs whenever one of them has changed
+        """
+        n, arrays = self.count, self.arrays
+        parts = (arrays.active_points[:n], arrays.active_entries[:n], arrays.clock)
+        return b"".join(part.tobytes() for part in parts)
+
     def state(self) -> dict[str, Any]:
         """
         :return: tensors and numbers from which :meth:`set_state` restores the traces exactly

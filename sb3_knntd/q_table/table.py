@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_knntd.common.state_checks import checked_points, checked_tensor
 from sb3_knntd.common.tracing import is_traced
-from sb3_knntd.kernels.traces import TableArrays, overwrite, read_rows, rehash, write_back
+from sb3_knntd.kernels.traces import MOST_VISITS, TableArrays, overwrite, read_rows, rehash, write_back
 from sb3_knntd.q_table.active_traces import ActiveTraces, make_slots
 
 #: Number of points whose values are carried over at a time.
@@ -52,6 +52,8 @@ class QTable(nn.Module, ABC):
         #: incremented whenever arrays have been replaced or set to other values
         self.version = 0
         self.traces = ActiveTraces(n_actions, n_envs=1, capacity=0)
+        #: the traces when ``values`` was last brought up to date
+        self._written = b""
 
     def __getstate__(self) -> dict[str, Any]:
         # A lock cannot be copied or pickled.
@@ -101,6 +103,7 @@ class QTable(nn.Module, ABC):
         if self.traces.count:
             with self.lock:
                 write_back(self.arrays(), self.traces.arrays)
+                self._written = self.traces.snapshot()
 
     def forget_traces(self) -> None:
         """Drop all traces and the values of the entries with a trace."""
@@ -111,6 +114,19 @@ class QTable(nn.Module, ABC):
     def entries(self) -> th.Tensor:
         """
         :return: all rows, up to date, shape (n_rows, n_actions)
+        """
+
+    @abstractmethod
+    def counts(self) -> th.Tensor:
+        """
+        :return: the number of learning steps that have updated each row, up to 2³⁰, shape (n_rows,), int32
+        """
+
+    @abstractmethod
+    def counts_at(self, indices: th.Tensor) -> th.Tensor:
+        """
+        :param indices: points, any shape, int64
+        :return: the number of learning steps that have updated each, the same shape, int32
         """
 
     @abstractmethod
@@ -160,6 +176,22 @@ class QTable(nn.Module, ABC):
         """
 
     @abstractmethod
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        """
+        :param points: points, shape (n,), int64
+        :return: whether each has been updated by learning, shape (n,), bool
+        """
+
+    @abstractmethod
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        """
+        Set the rows of some points. All traces are dropped.
+
+        :param points: different points, shape (n,), int64
+        :param values: their values, shape (n, n_actions)
+        """
+
+    @abstractmethod
     def arrays(self) -> TableArrays:
         """
         :return: the arrays for the kernels, which share memory with this table
@@ -195,37 +227,31 @@ class DenseTable(QTable):
     :param dtype: floating type of the entries
     """
 
-    visited: th.Tensor
+    visits: th.Tensor
 
     def __init__(self, n_points: int, n_actions: int, initial_value: float, dtype: th.dtype) -> None:
         super().__init__(n_actions, initial_value)
         self.register_buffer("values", th.full((n_points, n_actions), self.initial_value, dtype=dtype))
-        self.register_buffer("visited", self._no_visits(n_points))
-
-    @staticmethod
-    def _no_visits(n_points: int) -> th.Tensor:
-        """A bit for each row: whether it has been updated by learning; and one spare byte at the end."""
-        return th.zeros((n_points + 7) // 8 + 1, dtype=th.uint8)
+        self.register_buffer("visits", th.zeros(n_points, dtype=th.int32))
 
     @property
     def n_visited(self) -> int:
-        return int(np.unpackbits(self.visited.cpu().numpy()[:-1]).sum())
+        return int((self.visits > 0).sum())
 
     def visit(self, indices: th.Tensor) -> None:
         """
-        Mark points as visited.
+        Count a learning step that updates these points.
 
-        :param indices: point indices, any shape, int64
+        :param indices: point indices, any shape, int64; a point that is named twice is updated by two steps
         """
-        self._visit(self.visited, indices)
+        points = indices.reshape(-1)
+        self.visits.index_add_(0, points, (self.visits[points] < MOST_VISITS).int())
 
-    @staticmethod
-    def _visit(visited: th.Tensor, indices: th.Tensor) -> None:
-        byte, bit = indices.reshape(-1) >> 3, indices.reshape(-1) & 7
-        for each in range(8):
-            # Concurrent writes to a byte write the same value; points with another bit write to the spare byte.
-            at = th.where(bit == each, byte, len(visited) - 1)
-            visited[at] = visited[at] | (1 << each)
+    def counts(self) -> th.Tensor:
+        return self.visits
+
+    def counts_at(self, indices: th.Tensor) -> th.Tensor:
+        return self.visits[indices]
 
     def entries(self) -> th.Tensor:
         self._write_back()
@@ -235,6 +261,11 @@ class DenseTable(QTable):
         return None
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
+        if is_traced() and self.traces.count and self._written != self.traces.snapshot():
+            raise ValueError(
+                "the table has been learned into since its tensor was last brought up to date, and what is traced or "
+                "exported now would be of before: call model.policy.eval() first"
+            )
         if is_traced() or not self.traces.count:
             with self.lock:
                 return self.values[indices]
@@ -245,24 +276,30 @@ class DenseTable(QTable):
 
     def add_rows(self, values: th.Tensor) -> None:
         with self.lock:
-            n_points = len(self.values) + len(values)
             grown = th.cat((self.values, values.to(self.values)))
-            visited = self._no_visits(n_points).to(self.values.device)
-            visited[: len(self.visited) - 1] = self.visited[:-1]
-            self.values, self.visited = grown, visited
+            self.values, self.visits = grown, th.cat((self.visits, self.visits.new_zeros(len(values))))
             self.version += 1
+
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        has_visited: th.Tensor = self.counts()[points] > 0
+        return has_visited
+
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        with self.lock:
+            self.drop_traces()
+            self.values[points] = values.to(self.values)
 
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
-            old, was_visited = self.entries(), self._visits()
-            values, visited = th.empty_like(old), th.zeros_like(self.visited)
+            old = self.entries()
+            values, visits = th.empty_like(old), th.empty_like(self.visits)
             for points in th.arange(len(old), device=old.device).split(BATCH):
                 sources = regridding.sources(points)
                 values[points] = self._carried(old[sources[0]], sources)
-                self._visit(visited, points[was_visited[sources[0][:, 0]]])
+                visits[points] = self.visits[sources[0][:, 0]]
             self.forget_traces()
             self.values.copy_(values)
-            self.visited.copy_(visited)
+            self.visits.copy_(visits)
 
     def resize(self, n_points: int) -> None:
         """
@@ -274,17 +311,12 @@ class DenseTable(QTable):
             with self.lock:
                 self.forget_traces()
                 self.values = self.values.new_full((n_points, self.n_actions), self.initial_value)
-                self.visited = self._no_visits(n_points).to(self.values.device)
-
-    def _visits(self) -> th.Tensor:
-        """Whether each row has been updated by learning, shape (n_points,), bool."""
-        bits = th.arange(8, device=self.visited.device, dtype=th.uint8)
-        return ((self.visited[:-1, None] >> bits) & 1).bool().flatten()[: len(self.values)]
+                self.visits = self.visits.new_zeros(n_points)
 
     def arrays(self) -> TableArrays:
         return TableArrays(
             values=self.values.numpy(),
-            visited=self.visited.numpy(),
+            visits=self.visits.numpy(),
             row_points=np.empty(0, np.int64),
             row_slots=np.empty((0, 2), np.int64),
             n_rows=np.zeros(1, np.int64),
@@ -301,8 +333,21 @@ class DenseTable(QTable):
             # Missing tensors and wrong shapes are reported by torch.
             if prefix + "values" in state_dict:
                 checked_tensor(state_dict, prefix + "values", (None, None))
+            state_dict = _counted(state_dict, prefix, len(self.visits))
             self.forget_traces()
             super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _counted(state_dict: Any, prefix: str, n_points: int) -> Any:
+    """The state with checked visits. Versions that did not count them saved a bit for each point: one visit or none."""
+    state = dict(state_dict)
+    bits = state.pop(prefix + "visited", None)
+    if isinstance(bits, th.Tensor) and bits.dtype == th.uint8:
+        visited = np.unpackbits(bits.cpu().numpy(), bitorder="little")[:n_points]
+        state.setdefault(prefix + "visits", th.from_numpy(visited.astype(np.int32)))
+    if prefix + "visits" in state:
+        checked_tensor(state, prefix + "visits", (None,), th.int32, 0)
+    return state
 
 
 class GrowingTable(DenseTable):
@@ -326,10 +371,13 @@ class GrowingTable(DenseTable):
 
     @property
     def n_visited(self) -> int:
-        return int(self._visits()[: self.n_rows].sum())
+        return int((self.counts() > 0).sum())
 
     def entries(self) -> th.Tensor:
         return super().entries()[: self.n_rows]
+
+    def counts(self) -> th.Tensor:
+        return self.visits[: self.n_rows]
 
     def add_rows(self, values: th.Tensor) -> None:
         values = values.to(self.values)
@@ -337,9 +385,9 @@ class GrowingTable(DenseTable):
             n_rows = self.n_rows + len(values)
             if n_rows > len(self.values):
                 self._write_back()
-                self._set(*self._made_of(self.values[: self.n_rows], self._visits()[: self.n_rows], 2 * n_rows))
+                self._set(self.values[: self.n_rows], self.counts(), 2 * n_rows)
             for row, new in enumerate(values, self.n_rows):
-                self._visit_not(row)
+                self.visits[row] = 0
                 if self.values.is_cpu:
                     overwrite(row, new.numpy(), self.arrays(), self.traces.arrays)
                 else:
@@ -348,23 +396,21 @@ class GrowingTable(DenseTable):
 
     def merge_rows(self, moved: th.Tensor) -> None:
         """
-        Give each point the mean of the values of the points that became it, of the visited ones if there are any. All
-        traces are dropped.
+        Give each point the mean of the values of the points that became it, of the visited ones if there are any, and
+        the sum of their visits. All traces are dropped.
 
         :param moved: the new index of each point, shape (n_rows,), int64, counted from 0 without gaps
         """
         with self.lock:
-            values, visits = self.entries(), self._visits()[: self.n_rows]
+            values, visits = self.entries(), self.counts()
             n_rows = int(moved.max()) + 1
-            counts = self._sums(moved, visits.to(values.dtype)[:, None], n_rows)
-            visited = counts[:, 0] > 0
+            sums = self._sums(moved, visits.long()[:, None], n_rows)[:, 0]
             # Where no point was visited, all count.
-            counting = (visits | ~visited[moved]).to(values.dtype)[:, None]
+            counting = ((visits > 0) | (sums[moved] == 0)).to(values.dtype)[:, None]
             means = self._sums(moved, counting * values, n_rows) / self._sums(moved, counting, n_rows)
-            # As many rows as before: another thread may be about to read a point by its old index.
-            grown = self._made_of(means, visited, len(self.values))
             self.forget_traces()
-            self._set(*grown)
+            # As many rows as before: another thread may be about to read a point by its old index.
+            self._set(means, sums.clamp(max=MOST_VISITS).int(), len(self.values))
             self.n_rows = n_rows
 
     def resize(self, n_points: int) -> None:
@@ -375,9 +421,8 @@ class GrowingTable(DenseTable):
         """
         with self.lock:
             nothing = self.values.new_full((n_points, self.n_actions), self.initial_value)
-            grown = self._made_of(nothing, self.visited.new_zeros(n_points, dtype=th.bool), 2 * n_points)
             self.forget_traces()
-            self._set(*grown)
+            self._set(nothing, self.visits.new_zeros(n_points), 2 * n_points)
             self.n_rows = n_points
 
     @staticmethod
@@ -385,41 +430,31 @@ class GrowingTable(DenseTable):
         """Sums over the rows of each group."""
         return rows.new_zeros((n_groups, rows.shape[1])).index_add_(0, groups, rows)
 
-    def _made_of(self, values: th.Tensor, visits: th.Tensor, n_rows: int) -> tuple[th.Tensor, th.Tensor]:
-        """New arrays of ``n_rows`` rows or more that begin with these."""
+    def _set(self, values: th.Tensor, visits: th.Tensor, n_rows: int) -> None:
+        """Take new arrays of ``n_rows`` rows or more that begin with these."""
         n_rows = max(n_rows, self.SMALLEST, self.n_neighbors)
         grown = values.new_full((n_rows, self.n_actions), self.initial_value)
         grown[: len(values)] = values
-        visited = self._no_visits(n_rows).to(values.device)
-        self._visit(visited, visits.nonzero()[:, 0])
-        return grown, visited
-
-    def _set(self, values: th.Tensor, visited: th.Tensor) -> None:
-        self.values, self.visited = values, visited
+        counted = visits.new_zeros(n_rows)
+        counted[: len(visits)] = visits
+        self.values, self.visits = grown, counted
         self.version += 1
-
-    def _visit_not(self, row: int) -> None:
-        self.visited[row >> 3] &= ~(1 << (row & 7)) & 0xFF
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         with self.lock:
-            visited = self._no_visits(self.n_rows).to(self.visited.device)
-            self._visit(visited, self._visits()[: self.n_rows].nonzero()[:, 0])
             destination[prefix + "values"] = self.entries().clone()
-            destination[prefix + "visited"] = visited
+            destination[prefix + "visits"] = self.counts().clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        if not {prefix + "values", prefix + "visited"} <= set(state_dict):
+        if not {prefix + "values", prefix + "visits"} <= set(state_dict):
             # torch reports what is missing.
             super()._load_from_state_dict(state_dict, prefix, *args)
             return
         values = checked_tensor(state_dict, prefix + "values", (self.n_rows, self.n_actions))
-        visited = checked_tensor(state_dict, prefix + "visited", self._no_visits(self.n_rows).shape, th.uint8)
+        visits = checked_tensor(state_dict, prefix + "visits", (self.n_rows,), th.int32, 0)
         with self.lock:
-            bits = th.from_numpy(np.unpackbits(visited.cpu().numpy()[:-1], bitorder="little")[: self.n_rows]).bool()
-            grown = self._made_of(values.to(self.values), bits.to(self.visited.device), 2 * self.n_rows)
             self.forget_traces()
-            self._set(*grown)
+            self._set(values.to(self.values), visits.to(self.visits.device), 2 * self.n_rows)
 
 
 class _Rows(NamedTuple):
@@ -428,12 +463,14 @@ class _Rows(NamedTuple):
 
     :param values: shape (capacity, n_actions)
     :param points: the point of each row, shape (capacity,), int64
+    :param visits: the number of learning steps that have updated each row, shape (capacity,), int32
     :param slots: hash from points to rows
     :param n_used: number of rows in use, shape (1,), int64
     """
 
     values: th.Tensor
     points: th.Tensor
+    visits: th.Tensor
     slots: np.ndarray
     n_used: np.ndarray
 
@@ -456,19 +493,21 @@ class HashedTable(QTable):
         self.n_points = n_points
         no_points, no_values = th.empty(0, dtype=th.int64), th.empty((0, n_actions), dtype=dtype)
         # Replaced as a whole, so that an interruption leaves all rows unchanged.
-        self._rows = self._made_of(no_points, no_values, self.SMALLEST)
+        self._rows = self._made_of(no_points, no_values, th.empty(0, dtype=th.int32), self.SMALLEST)
 
-    def _made_of(self, points: th.Tensor, values: th.Tensor, capacity: int) -> _Rows:
+    def _made_of(self, points: th.Tensor, values: th.Tensor, visits: th.Tensor, capacity: int) -> _Rows:
         """Allocate ``capacity`` rows and fill the first ones."""
         n = len(points)
         rows = _Rows(
             th.full((capacity, self.n_actions), self.initial_value, dtype=values.dtype),
             th.full((capacity,), -1, dtype=th.int64),
+            th.zeros(capacity, dtype=th.int32),
             make_slots(capacity),
             np.array([n]),
         )
         rows.values[:n] = values
         rows.points[:n] = points
+        rows.visits[:n] = visits
         rehash(rows.points.numpy(), n, rows.slots)
         return rows
 
@@ -486,15 +525,25 @@ class HashedTable(QTable):
             self._write_back()
             return self.values[: self.n_visited]
 
+    def counts(self) -> th.Tensor:
+        return self._rows.visits[: self.n_visited]
+
+    def counts_at(self, indices: th.Tensor) -> th.Tensor:
+        if not self.n_visited:
+            return th.zeros_like(indices, dtype=th.int32)
+        points, order = self.points().sort()
+        nearest = th.searchsorted(points, indices.contiguous()).clamp(max=len(points) - 1)
+        return self.counts()[order[nearest]] * (points[nearest] == indices)
+
     def points(self) -> th.Tensor:
         return self._rows.points[: self.n_visited]
 
     def rows(self, indices: th.Tensor) -> th.Tensor:
         if is_traced():
             raise ValueError(
-                "a policy with a hashed table cannot be traced or exported: its rows are found by compiled code. Make "
-                "the model with policy_kwargs={'table': 'dense'}, and fewer points if it would not fit; predict works "
-                "with every table"
+                "a policy with a hashed table cannot be traced or exported by torch's own functions: its rows are "
+                "found by compiled code. Call model.policy.export(path, 'torchscript') or (path, 'torch_export') "
+                "instead, or make the model with policy_kwargs={'table': 'dense'}"
             )
         return super().rows(indices)
 
@@ -503,32 +552,45 @@ class HashedTable(QTable):
         if len(rows.values) - n >= n_points:
             return False
         capacity = max(2 * len(rows.values), n + n_points)
-        self._rows = self._made_of(rows.points[:n], rows.values[:n], capacity)
+        self._rows = self._made_of(rows.points[:n], rows.values[:n], rows.visits[:n], capacity)
         return True
 
     def add_rows(self, values: th.Tensor) -> None:
         raise ValueError("points can be added to a dense table only: policy_kwargs={'table': 'dense'}")
 
+    def has_visited(self, points: th.Tensor) -> th.Tensor:
+        return th.isin(points, self.points())
+
+    def write(self, points: th.Tensor, values: th.Tensor) -> None:
+        with self.lock:
+            self._write_back()
+            others = ~th.isin(self.points(), points)
+            kept = self.values[: self.n_visited][others]
+            visits = th.cat((self.counts()[others], self.counts_at(points)))
+            self._refill(th.cat((self.points()[others], points)), th.cat((kept, values.to(kept))), visits)
+
     def carry_over(self, regridding: Regridding) -> None:
         with self.lock:
             points = th.cat([regridding.targets(part) for part in self.points().split(BATCH)]).unique()
-            values = th.cat([self._carried(self.rows(s[0]), s) for s in map(regridding.sources, points.split(BATCH))])
-            self._refill(points, values)
+            sources = [regridding.sources(part) for part in points.split(BATCH)]
+            values = th.cat([self._carried(self.rows(each[0]), each) for each in sources])
+            visits = th.cat([self.counts_at(each[0][:, 0]) for each in sources])
+            self._refill(points, values, visits)
 
     def arrays(self) -> TableArrays:
         rows = self._rows
         return TableArrays(
             values=rows.values.numpy(),
-            visited=np.empty(0, np.uint8),
+            visits=rows.visits.numpy(),
             row_points=rows.points.numpy(),
             row_slots=rows.slots,
             n_rows=rows.n_used,
             initial_value=self.initial_value,
         )
 
-    def _refill(self, points: th.Tensor, values: th.Tensor) -> None:
+    def _refill(self, points: th.Tensor, values: th.Tensor, visits: th.Tensor) -> None:
         """Replace all rows by these."""
-        rows = self._made_of(points, values, max(self.SMALLEST, len(points)))
+        rows = self._made_of(points, values, visits, max(self.SMALLEST, len(points)))
         self.forget_traces()
         self._rows = rows
 
@@ -544,9 +606,14 @@ class HashedTable(QTable):
         with self.lock:
             destination[prefix + "values"] = self.entries().clone()
             destination[prefix + "row_points"] = self.points().clone()
+            destination[prefix + "row_visits"] = self.counts().clone()
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         with self.lock:
             points = checked_points(state_dict, prefix + "row_points", self.n_points)
             values = checked_tensor(state_dict, prefix + "values", (len(points), self.n_actions))
-            self._refill(points, values.to(self.values.dtype))
+            # Versions that did not count visits did not save them, and every row was visited.
+            visits = th.ones(len(points), dtype=th.int32)
+            if prefix + "row_visits" in state_dict:
+                visits = checked_tensor(state_dict, prefix + "row_visits", (len(points),), th.int32, 0)
+            self._refill(points, values.to(self.values.dtype), visits)

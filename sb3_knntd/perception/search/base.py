@@ -89,28 +89,6 @@ class Search(ABC):
         return SearchArguments(int(SearchKind.OUTSIDE))
 
 
-def nearest_by_tensors(scaled: th.Tensor, places: th.Tensor, k: int) -> Neighbors:
-    """
-    Exact search with torch operations that can be traced and exported.
-
-    :param scaled: observations in scaled units, shape (batch, obs_dim)
-    :param places: the points, shape (n_points, obs_dim), scaled units
-    :param k: number of neighbours
-    :return: the first k by (squared distance, index)
-    """
-    distances = th.zeros_like(scaled[:, :1] * places[:, 0])
-    for dimension in range(places.shape[1]):
-        distances = distances + (scaled[:, dimension, None] - places[:, dimension]).square()
-    indices, nearest = [], []
-    for _ in range(k):
-        # argmin returns the first of several minima.
-        index = distances.argmin(dim=1, keepdim=True)
-        indices.append(index)
-        nearest.append(distances.gather(1, index))
-        distances = distances.scatter(1, index, th.inf)
-    return Neighbors(th.cat(indices, dim=1), th.cat(nearest, dim=1))
-
-
 def nearest_of_candidates(queries: np.ndarray, places: np.ndarray, candidates: np.ndarray, k: int) -> Neighbors:
     """
     :param queries: shape (batch, obs_dim), scaled units
