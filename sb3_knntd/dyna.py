@@ -297,6 +297,16 @@ class KNNDyna(KNNAlgorithm):
         scaled = self.learner.scaled_actions(columns)[0]
         return self.learner.planner.predict(obs.reshape(-1).astype(np.float64), scaled)
 
+    @property
+    def known(self) -> np.ndarray:
+        """Whether the model knows what follows on an action at a point, shape (n_points, n_actions), bool."""
+        return self.learner.planner.known
+
+    @property
+    def visited(self) -> np.ndarray:
+        """The observations that the remembered transitions began at, shape (n, obs_dim), observation units."""
+        return self.learner.planner.visited
+
     # ---------------------------------------------------------- learning offline
 
     def imitate(self: SelfKNNDyna, controller: Any, n_steps: int = 5000, margin: float | None = None) -> SelfKNNDyna:

@@ -151,6 +151,11 @@ class Planner(ABC):
 
     @property
     @abstractmethod
+    def visited(self) -> np.ndarray:
+        """The observations that the remembered transitions began at, shape (n, obs_dim), observation units."""
+
+    @property
+    @abstractmethod
     def known(self) -> np.ndarray:
         """Whether an action is known at a point, shape (n_points, n_actions), bool."""
 

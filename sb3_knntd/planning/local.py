@@ -111,6 +111,10 @@ class LocalPlanner(Planner):
         return self.buffer.n_transitions
 
     @property
+    def visited(self) -> np.ndarray:
+        return self.buffer.observations[: self.buffer.n_transitions]
+
+    @property
     def known(self) -> np.ndarray:
         return self.model.known
 

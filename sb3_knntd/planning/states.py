@@ -50,6 +50,12 @@ class StatePlanner(Planner):
         return int(self._tried.sum())
 
     @property
+    def visited(self) -> np.ndarray:
+        states = np.flatnonzero(self.known.any(axis=1))
+        visited: np.ndarray = self.policy.points.cpu().numpy()[states]
+        return visited
+
+    @property
     def known(self) -> np.ndarray:
         known: np.ndarray = self._tried > 0
         return known

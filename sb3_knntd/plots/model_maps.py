@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_knntd.base import KNNAlgorithm
-from sb3_knntd.dyna import KNNDyna
-from sb3_knntd.planning import LocalPlanner
+from sb3_knntd.model import Prediction
 from sb3_knntd.plots.figures import BASELINE_COLOR, LINE_COLOR, UNLEARNED_COLOR, figure_of, new_figure
 from sb3_knntd.plots.grids import check_dims
 from sb3_knntd.plots.names import Names, names_for
+from sb3_knntd.policies import TableModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Number of panels in a row.
 COLUMNS = 3
+
+
+@runtime_checkable
+class PlanningModel(TableModel, Protocol):
+    """A model that has learned what follows on an action, such as KNNDyna."""
+
+    known: np.ndarray
+    visited: np.ndarray
+
+    def predict_next(self, observation: np.ndarray, action: np.ndarray | int) -> Prediction:
+        """What the model expects after a step."""
 
 
 class Rollout(NamedTuple):
@@ -38,7 +48,7 @@ class Rollout(NamedTuple):
 
 
 def plot_model_points(
-    model: KNNAlgorithm, dims: tuple[int, int] = (0, 1), axes: Axes | None = None, names: Names | None = None
+    model: TableModel, dims: tuple[int, int] = (0, 1), axes: Axes | None = None, names: Names | None = None
 ) -> Axes:
     """
     Plot the points of a model over two dimensions of the observations, coloured by the number of actions that are known
@@ -63,14 +73,12 @@ def plot_model_points(
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
     points, title = model.policy.points.cpu().numpy(), f"{len(model.policy.points):,} points"
-    if isinstance(model, KNNDyna):
-        planner = model.learner.planner
-        assert isinstance(planner, LocalPlanner)
-        visited, known = planner.buffer.observations[: planner.n_transitions], planner.known
+    if isinstance(model, PlanningModel):
+        visited, known = model.visited, model.known
         axes.plot(visited[:, across], visited[:, up], ".", color="0.55", markersize=1.5, markeredgewidth=0, zorder=1)
         title += f", {len(visited):,} transitions"
     else:
-        known = (model.policy.q_table != model.initial_value).cpu().numpy()
+        known = (model.policy.q_table != model.policy.table.initial_value).cpu().numpy()
     counts, n_actions = known.sum(axis=1), known.shape[1]
     # The first of these colours is that of no known action.
     colors = ListedColormap([UNLEARNED_COLOR, *colormaps["viridis_r"](np.linspace(0.12, 1.0, n_actions))])
@@ -92,7 +100,7 @@ def plot_model_points(
     return axes
 
 
-def roll_out(model: KNNDyna, observation: np.ndarray, actions: np.ndarray) -> Rollout:
+def roll_out(model: PlanningModel, observation: np.ndarray, actions: np.ndarray) -> Rollout:
     """
     Let a model go from an observation by given actions. It ends before them where the model expects the end of the
     episode, or has never seen the action.
@@ -117,7 +125,7 @@ def roll_out(model: KNNDyna, observation: np.ndarray, actions: np.ndarray) -> Ro
 
 
 def plot_rollout(
-    model: KNNDyna,
+    model: PlanningModel,
     observations: np.ndarray,
     actions: np.ndarray,
     rewards: Sequence[float] | np.ndarray | None = None,
@@ -151,7 +159,7 @@ def plot_rollout(
     :return: the axes; see :func:`figure_of` for their figure
     :raises ValueError: if nothing has been learned yet, the observations are not a Box, or an argument does not fit
     """
-    if not isinstance(model, KNNDyna):
+    if not isinstance(model, PlanningModel):
         raise ValueError(f"model must be a KNNDyna, which has a model of its environment; got a {type(model).__name__}")
     n_dims = _count_dims(model, 1)
     real, given = np.asarray(observations, dtype=np.float64), np.asarray(actions)
@@ -203,7 +211,7 @@ def plot_rollout(
     return tuple(axes)
 
 
-def _count_dims(model: KNNAlgorithm, least: int) -> int:
+def _count_dims(model: TableModel, least: int) -> int:
     space = model.observation_space
     if not isinstance(space, spaces.Box) or space.shape[0] < least:
         raise ValueError(f"observations must be a Box of {least} or more dimensions; got {space}")
