@@ -109,7 +109,8 @@ class PerceptionStatsCallback(ThrottledCallback):
         sample = Transitions(*map(np.concatenate, zip(*self._sample, strict=True)))
         table, points = model.policy.table, model.policy.perceiver.points
         probabilities = model.policy.perceive(sample.observations).probabilities
-        record("perception/visited_share", table.n_visited / points.n_points)
+        # KNNDyna has no points before its first plan.
+        record("perception/visited_share", table.n_visited / max(points.n_points, 1))
         record("perception/neighbors", float((1.0 / probabilities.square().sum(dim=1)).mean()))
         record("perception/outside_share", self._outside(sample.observations))
         errors = self._td_errors(sample)

@@ -44,7 +44,9 @@ class ThrottledCallback(BatchedCallback):
         :raises ValueError: if it is not a model of this package
         """
         if not isinstance(model, KNNAlgorithm):
-            raise ValueError(f"{type(self).__name__} needs a model of KNNTD or ExA; got a {type(model).__name__}")
+            raise ValueError(
+                f"{type(self).__name__} needs a model of KNNTD, ExA or KNNDyna; got a {type(model).__name__}"
+            )
         super().init_callback(model)
 
     def _on_training_start(self) -> None:

@@ -31,7 +31,7 @@ from sb3_knntd.callbacks import (
 )
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 from sb3_knntd.filters import DeltaFilter, VecDeltaFilter
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -108,9 +108,11 @@ class Point(gym.Env[np.ndarray, Any]):
 TWO, BOX = spaces.Discrete(2), spaces.Box(-1.0, 1.0, (1,), np.float32)
 
 
-def learn(algorithm: type[KNNTD | ExA], arguments: dict[str, Any]) -> None:
-    model = algorithm(Point(TWO if algorithm is KNNTD else BOX), **arguments).learn(10)
-    assert model.num_timesteps == 10
+def learn(algorithm: type[KNNTD | ExA | KNNDyna], arguments: dict[str, Any]) -> None:
+    # KNNDyna first plans after 25 steps.
+    n_steps = 30 if algorithm is KNNDyna else 10
+    model = algorithm(Point(TWO if algorithm is KNNTD else BOX), **arguments).learn(n_steps)
+    assert model.num_timesteps == n_steps
     assert th.isfinite(model.policy.q_table).all()
     assert model.action_space.contains(model.predict(np.zeros(2, np.float32), deterministic=True)[0])
 
@@ -138,6 +140,7 @@ numbers = itertools.count()
 MAKERS: dict[type[Any], Callable[[dict[str, Any]], None]] = {
     KNNTD: lambda arguments: learn(KNNTD, arguments),
     ExA: lambda arguments: learn(ExA, arguments),
+    KNNDyna: lambda arguments: learn(KNNDyna, arguments),
     DeltaFilter: lambda arguments: walk(DeltaFilter(Point(TWO), **arguments)),
     VecDeltaFilter: lambda arguments: walk_all(VecDeltaFilter(DummyVecEnv([lambda: Point(TWO)] * 2), **arguments)),
     ValueMapCallback: lambda arguments: watch(ValueMapCallback, arguments, folder="maps", resolution=3),
@@ -151,7 +154,7 @@ MAKERS: dict[type[Any], Callable[[dict[str, Any]], None]] = {
     HParamCallback: lambda arguments: watch(HParamCallback, arguments),
 }
 #: Classes with more arguments are drawn more often.
-KINDS = [KNNTD] * 6 + [ExA] * 6 + [DeltaFilter] * 3 + [VecDeltaFilter] * 2 + list(MAKERS)[4:]
+KINDS = [KNNTD] * 6 + [ExA] * 6 + [KNNDyna] * 4 + [DeltaFilter] * 3 + [VecDeltaFilter] * 2 + list(MAKERS)[5:]
 #: Arguments that are not varied: environments, which other tests cover, and internal arguments.
 LEFT_OUT = {"self", "policy", "env", "venv", "_init_setup_model"}
 
@@ -185,7 +188,7 @@ def confined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Run in an empty folder, with a memory limit and a timeout."""
     monkeypatch.chdir(tmp_path)
     # Compile once before the memory is limited.
-    for kind in (KNNTD, ExA, DeltaFilter):
+    for kind in (KNNTD, ExA, KNNDyna, DeltaFilter):
         MAKERS[kind]({})
     resource = limits = None
     if sys.platform == "linux":

@@ -1,6 +1,7 @@
 """KNNDyna as an SB3 algorithm: learning, exploring, saving and resuming."""
 
 import copy
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,8 +11,10 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
+from toy_envs import DriftEnv
 
 from sb3_knntd import KNNDyna
+from sb3_knntd.planning import LocalPlanner
 
 ENVS = ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"]
 
@@ -226,3 +229,23 @@ def test_reward_functions_are_checked():
         KNNDyna("Pendulum-v1", reward_function=lambda observation, action, after: np.nan)
     with pytest.raises(ValueError, match=r"reward_function needs a Box of observations"):
         KNNDyna("FrozenLake-v1", reward_function=lambda observation, action, after: 0.0)
+
+
+def test_an_episode_that_begins_outside_of_what_was_seen() -> None:
+    """The planner's model and values follow when the points are laid anew."""
+
+    class FarAway(DriftEnv):
+        def _observe(self) -> Any:
+            return np.float32([2.5, 0.0])
+
+    model = KNNDyna(DriftEnv(), spacing=0.1, simulated_steps=5, seed=0).learn(150)
+    before = len(model.policy.points)
+    model.set_env(FarAway())
+    for n_steps in (3, 60):
+        model.learn(n_steps, reset_num_timesteps=False)
+        planner = model.learner.planner
+        assert isinstance(planner, LocalPlanner)
+        assert len(planner.known) == len(model.policy.points) == len(model.policy.q_table) != before
+        scaled = model.policy.perceiver.points.coordinates(model.policy.perceiver.bounds).numpy()
+        np.testing.assert_array_equal(planner.model.arrays.points[: len(scaled)], scaled)
+    assert model.predict_next(np.float32([2.5, 0.0]), 1).known

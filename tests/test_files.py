@@ -19,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from algorithms import ALGORITHMS
 from gymnasium import spaces
 from sb3_knntd.callbacks import EpisodeVideoCallback, TableCheckpointCallback, ValueMapCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -26,11 +27,11 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from toy_envs import DriftEnv
 
-from sb3_knntd import KNNTD, DeltaFilter, ExA, VecDeltaFilter
+from sb3_knntd import KNNTD, DeltaFilter, ExA, KNNDyna, VecDeltaFilter
 from sb3_knntd.common.files import replace_file
 from sb3_knntd.common.plain import decode, encode
 
-MakeModel = Callable[..., KNNTD | ExA]
+MakeModel = Callable[..., KNNTD | ExA | KNNDyna]
 MakeVenv = Callable[..., VecEnv]
 POSIX = pytest.mark.skipif(os.name != "posix", reason="links, permissions and locks of POSIX systems")
 
@@ -263,10 +264,14 @@ ORDINARY: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("algorithm", [KNNTD, ExA])
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("name", ORDINARY)
 def test_an_ordinary_model_needs_no_trust(
-    algorithm: type[KNNTD | ExA], make_model: MakeModel, make_venv: MakeVenv, tmp_path: pathlib.Path, name: str
+    algorithm: type[KNNTD | ExA | KNNDyna],
+    make_model: MakeModel,
+    make_venv: MakeVenv,
+    tmp_path: pathlib.Path,
+    name: str,
 ) -> None:
     model = make_model(**ORDINARY[name]).learn(101)
     model.save(tmp_path / "model.zip")

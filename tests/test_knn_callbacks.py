@@ -46,7 +46,7 @@ from stable_baselines3.common.vec_env import (
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from toy_envs import DriftEnv, GridEnv, RecordingVecEnv
 
-from sb3_knntd import KNNTD, ExA, VecDeltaFilter
+from sb3_knntd import KNNTD, ExA, KNNDyna, VecDeltaFilter
 from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.plots import figure_of, value_grid
 
@@ -101,6 +101,8 @@ ALGORITHMS: dict[str, Callable[..., KNNAlgorithm]] = {
     "ExA": lambda env: make_exa(env),
     "ExA, reference": lambda env: make_exa(env, policy_kwargs={"compiled": False}),
     "ExA, factored": lambda env: make_exa(env, action_table="factored"),
+    "KNNDyna": lambda env: KNNDyna(env, spacing=0.1, simulated_steps=5, seed=0),
+    "KNNDyna, Box": lambda env: KNNDyna(env, spacing=0.1, simulated_steps=5, seed=0),
 }
 
 
@@ -120,9 +122,9 @@ class Rendered(gym.Wrapper):  # type: ignore[type-arg]
         return self.generator.integers(0, 255, (40, 60, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize(("name", "n_envs"), list(zip(ALGORITHMS, [1, 2, 3, 3, 2, 1], strict=True)))
+@pytest.mark.parametrize(("name", "n_envs"), list(zip(ALGORITHMS, [1, 2, 3, 3, 2, 1, 2, 1], strict=True)))
 def test_all_together_change_nothing_that_is_learned(tmp_path: pathlib.Path, name: str, n_envs: int) -> None:
-    env = ContinuousDrift if name.startswith("ExA") else DriftEnv
+    env = ContinuousDrift if name.startswith("ExA") or name.endswith("Box") else DriftEnv
     if name == "ExA, factored":
         env = lambda **kwargs: ContinuousDrift(2, **kwargs)  # noqa: E731
 
@@ -164,7 +166,7 @@ def test_all_together_change_nothing_that_is_learned(tmp_path: pathlib.Path, nam
 )
 def test_another_algorithm_is_refused(tmp_path: pathlib.Path, make: Callable[..., BaseCallback]) -> None:
     dqn = DQN("MlpPolicy", "MountainCar-v0", buffer_size=10, policy_kwargs={"net_arch": [4]})
-    with pytest.raises(ValueError, match="needs a model of KNNTD or ExA; got a DQN"):
+    with pytest.raises(ValueError, match="needs a model of KNNTD, ExA or KNNDyna; got a DQN"):
         dqn.learn(10, callback=make(tmp_path))
 
 
@@ -670,9 +672,18 @@ def test_resume_restores_the_table_of_a_filter(make_venv: MakeVenv, tmp_path: pa
     resumed.learn(100, reset_num_timesteps=False)
 
 
-@pytest.mark.parametrize("cls", [KNNTD, ExA])
+def test_callbacks_before_there_are_points(tmp_path: pathlib.Path) -> None:
+    """KNNDyna lays its points after a number of steps."""
+    model = KNNDyna(DriftEnv(), seed=0)
+    model.set_logger(configure(str(tmp_path / "log"), ["csv"]))
+    model.learn(12, callback=[PerceptionStatsCallback(log_freq=6), ValueMapCallback(draw_freq=6, folder=tmp_path)])
+    assert len(model.policy.points) == 0
+    assert steps_in(tmp_path, "value_map_*.png") == [6, 12]
+
+
+@pytest.mark.parametrize("cls", [KNNTD, ExA, KNNDyna])
 def test_resume_finds_the_algorithm(tmp_path: pathlib.Path, cls: type[KNNAlgorithm]) -> None:
-    env_id = "MountainCar-v0" if cls is KNNTD else "MountainCarContinuous-v0"
+    env_id = "MountainCarContinuous-v0" if cls is ExA else "MountainCar-v0"
     model = cls(env_id, seed=0).learn(300, callback=TableCheckpointCallback(tmp_path))
     resumed = TableCheckpointCallback.resume(tmp_path, env_id)
     assert type(resumed) is cls

@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from toy_envs import DriftEnv, PushEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 from sb3_knntd.kernels import jit
 
 pytestmark = [
@@ -83,6 +83,19 @@ def test_it_acts_like_predict(
     assert together.dtype == expected.dtype
     np.testing.assert_array_equal(together, expected)
     np.testing.assert_array_equal(alone, expected[:1])
+
+
+@pytest.mark.parametrize("how", [traced, exported])
+@pytest.mark.parametrize("env_cls", [DriftEnv, PushEnv])
+def test_a_policy_that_was_planned(env_cls: type[DriftEnv], how: Callable[..., Any], places: np.ndarray) -> None:
+    model = KNNDyna(env_cls(), spacing=0.1, simulated_steps=5, seed=0).learn(203)
+    policy = how(model.policy, th.from_numpy(places[:2]))
+    expected, _ = model.predict(places, deterministic=True)
+    assert len(np.unique(expected)) > 1
+    with th.no_grad():
+        actions = policy(th.from_numpy(places), *(() if how is traced else (True,))).numpy()
+    assert actions.dtype == expected.dtype
+    np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-12)
 
 
 def test_actions_that_do_not_start_at_0_and_whole_ones(places: np.ndarray) -> None:

@@ -23,7 +23,7 @@ class Names(NamedTuple):
     actions: tuple[str, ...]
 
 
-#: Names for the environments of gymnasium whose spaces KNNTD or ExA supports.
+#: Names for the environments of gymnasium whose spaces the algorithms of this package support.
 NAMES = {
     "MountainCar-v0": Names(("position", "velocity (position per step)"), ("push left", "no push", "push right")),
     "CartPole-v1": Names(
