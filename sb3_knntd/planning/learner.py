@@ -257,6 +257,7 @@ class DynaLearner(Learner):
             strict=True,
         ):
             array[:] = tensor.numpy()
+        self.rules_version = self.selector.rules.version
 
     def _forget(self) -> None:
         """Nothing: there are no traces."""
