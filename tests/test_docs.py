@@ -168,7 +168,8 @@ def test_reference_has_every_command(capsys: pytest.CaptureFixture[str]) -> None
 def test_pictures_of_the_algorithms_are_drawn(tmp_path: Path) -> None:
     script = ROOT / "docs" / "pictures.py"
     subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
-    shown = re.findall(r"\(images/(\w+\.png)\)", (ROOT / "docs" / "algorithm.md").read_text(encoding="utf-8"))
+    pages = (ROOT / "docs" / name for name in ("algorithm.md", "knndyna.md"))
+    shown = re.findall(r"\(images/(\w+\.png)\)", "".join(page.read_text(encoding="utf-8") for page in pages))
     assert {path.name for path in tmp_path.iterdir()} == set(shown)
 
 
