@@ -169,3 +169,18 @@ def test_invalid_actions_are_refused_before_a_step_is_made(name: str, actions: A
     with pytest.raises(ValueError, match="action"):
         venv.step(np.array(actions))
     assert venv.get_attr("state") == before
+
+
+def test_rl_zoo_s_time_limit_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """RL Zoo puts a class of its own in the place of gymnasium's."""
+    limit = type("PatchedTimeLimit", (gym.wrappers.TimeLimit,), {})
+    monkeypatch.setattr("gymnasium.wrappers.TimeLimit", limit)
+    alone, together = pair("MountainCar", {"max_episode_steps": 30})
+    np.testing.assert_array_equal(alone.reset(), together.reset())
+    n_ended = 0
+    for _ in range(100):
+        one, other = alone.step(np.ones(N_ENVS, np.int64)), together.step(np.ones(N_ENVS, np.int64))
+        np.testing.assert_array_equal(one[0], other[0])
+        np.testing.assert_array_equal(one[2], other[2])
+        n_ended += one[2].sum()
+    assert n_ended >= 3 * N_ENVS

@@ -116,6 +116,7 @@ def test_a_minari_dataset(steps: Steps, expected: th.Tensor) -> None:
 
 def test_a_minari_dataset_by_name(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("h5py", reason="Minari stores data with it")
+    pytest.importorskip("jax", reason="Minari creates datasets with it")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     env = minari.DataCollector(gym.make("CartPole-v1"))
     random, steps = np.random.default_rng(0), []

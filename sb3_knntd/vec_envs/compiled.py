@@ -185,7 +185,8 @@ def _wrappers(env: gym.Env[Any, Any]) -> dict[type, Any]:
     """The wrappers of an environment by class; all are known, and none is there twice."""
     found: dict[type, Any] = {}
     while isinstance(env, gym.Wrapper):
-        kind = type(env)
+        # RL Zoo replaces gymnasium's class by its own, which acts the same on these environments.
+        kind = TimeLimit if type(env).__name__ in ("TimeLimit", "PatchedTimeLimit") else type(env)
         if kind not in (Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker) or kind in found:
             raise ValueError(
                 f"CompiledVecEnv makes the steps of environments itself, in one Monitor and the wrappers of "
