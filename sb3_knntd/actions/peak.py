@@ -10,7 +10,7 @@ import torch as th
 from sb3_knntd.actions.columns import ActionColumns
 from sb3_knntd.actions.exploration import EpsilonGreedy, greedy
 from sb3_knntd.actions.rules import Rules
-from sb3_knntd.actions.selection import MeanValueSelector, mean_rows
+from sb3_knntd.actions.selection import MeanValueSelector
 from sb3_knntd.kernels.selection import Target
 
 #: Parabolas that are flatter than this, relative to their values, have no peak.
@@ -81,7 +81,8 @@ class PeakSelector(MeanValueSelector):
         return actions
 
     def greedy_actions(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
-        values = mean_rows(rows, probabilities)
+        # Added one after the other: columns that are equal in all rows stay equal, whatever the number of columns.
+        values = (probabilities[..., None] * rows).cumsum(dim=1)[:, -1]
         return self.peak(values, greedy(values))
 
     def actions_of(self, action_indices: th.Tensor, probabilities: th.Tensor) -> th.Tensor:

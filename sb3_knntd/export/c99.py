@@ -264,7 +264,7 @@ class _Code:
             choice=self.fill(
                 templates.OF_ACTIONS if of_actions else templates.OF_VALUES,
                 factors=", ".join(map(str, factors)),
-                peak=" + peak_offset(values, best, j" + self.common["forbidden"] + ")" if frozen.interpolates else "",
+                peak=f" + peak_offset(values, best, j{self.common['forbidden']})" if frozen.interpolates else "",
             ).rstrip(),
             rounding=f"        action[j] = rint{self.f}(action[j]);\n" if whole else "",
         )

@@ -376,7 +376,7 @@ static real peak_offset(const real *values, int best, int j$forbidden_parameter)
 {
     const int step = step_of[j], place = best / step % n_points_of[j];
     const int below = best - step, above = best + step;
-    real left, right, slope_left, slope_right, curvature, offset, size;
+    real left, right, slope_left, slope_right, curvature, offset, magnitude;
     if (place == 0 || place == n_points_of[j] - 1$forbidden_beside)
         return $zero;
     left = action_points[best][j] - action_points[below][j];
@@ -384,8 +384,8 @@ static real peak_offset(const real *values, int best, int j$forbidden_parameter)
     slope_left = (values[best] - values[below]) / left;
     slope_right = (values[above] - values[best]) / right;
     curvature = (slope_right - slope_left) / (left + right);
-    size = fabs$f(values[best]) > $one ? fabs$f(values[best]) : $one;
-    if (!(curvature * ((left + right) * (left + right)) < -$least * size))
+    magnitude = fabs$f(values[best]) > $one ? fabs$f(values[best]) : $one;
+    if (!(curvature * ((left + right) * (left + right)) < -$least * magnitude))
         return $zero;
     offset = -$half * ((slope_left * right + slope_right * left) / (left + right)) / curvature;
     if (offset > $half * right)

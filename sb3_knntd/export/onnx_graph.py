@@ -257,9 +257,7 @@ def _peak_offsets(graph: _Graph, frozen: FrozenPolicy, values: str, best: str) -
         to_left = points[:, dimension] - points[below, dimension]
         to_right = points[above, dimension] - points[:, dimension]
         left, right, width = of_best(to_left), of_best(to_right), of_best(to_left + to_right)
-        low, high = (
-            graph("GatherElements", values, of_best(columns, np.int64), axis=1) for columns in (below, above)
-        )
+        low, high = (graph("GatherElements", values, of_best(columns, np.int64), axis=1) for columns in (below, above))
         slope_left = graph("Div", graph("Sub", middle, low), left)
         slope_right = graph("Div", graph("Sub", high, middle), right)
         curvature = graph("Div", graph("Sub", slope_right, slope_left), width)
