@@ -161,17 +161,19 @@ def observations_of(model: Model, n: int = N_OBSERVATIONS) -> np.ndarray:
     return drawn
 
 
-def assert_same_actions(model: Model, actions: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
+def assert_same_actions(
+    model: Model, actions: np.ndarray, expected: np.ndarray, rtol: float = 1e-7, atol: float = 1e-12
+) -> None:
     """Check actions against those of ``predict``."""
     if isinstance(model.action_space, spaces.Discrete):
         np.testing.assert_array_equal(actions, expected)
     elif isinstance(model, KNNDyna):
         # Of action points whose values differ by little more than rounding does, the peak is as uncertain.
         difference = np.abs(actions.astype(np.float64) - expected)
-        assert (difference < tolerance).mean() > 0.998
+        assert (difference < 1e-6).mean() > 0.998
         assert difference.max() < 1e-2
     else:
-        np.testing.assert_allclose(actions, expected, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(actions, expected, rtol=rtol, atol=atol)
 
 
 # ---------------------------------------------------------------------- C
@@ -231,7 +233,7 @@ def test_c_acts_like_predict(model: Model, compiler: str, tmp_path: Path) -> Non
     source, _ = model.policy.export(tmp_path / "policy.c", "c")
     actions, values = run_c(source, observations, compiler, "-O2")
     # A double that is rounded to the dtype of the action space.
-    assert_same_actions(model, actions, actions_as_rows(model, observations), 1e-6)
+    assert_same_actions(model, actions, actions_as_rows(model, observations), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(values, model.policy.q_values(observations).numpy(), rtol=1e-6, atol=1e-6)
 
 
@@ -293,7 +295,8 @@ def test_many_dimensions_are_for_c(tmp_path: Path) -> None:
     observations[:50] = 0.0  # the middle of a cell, as far from each of its 2^12 corners
     rows = policy.perceive(observations).indices[:, ::3].unique()
     values = th.from_numpy(np.random.default_rng(0).normal(size=(len(rows), 3)))
-    policy.load_state_dict({**policy.state_dict(), "table.row_points": rows, "table.values": values})
+    state = {"table.row_points": rows, "table.row_visits": th.ones(len(rows), dtype=th.int32), "table.values": values}
+    policy.load_state_dict({**policy.state_dict(), **state})
     expected, _ = policy.predict(observations)
     assert len(np.unique(expected)) == 3
     source, _ = policy.export(tmp_path / "policy", "c")
@@ -346,7 +349,7 @@ def test_onnx_acts_like_predict(model: Model, tmp_path: Path) -> None:
     expected = model.predict(observations, deterministic=True)[0]
     assert actions.dtype == expected.dtype
     assert actions.shape == expected.shape
-    assert_same_actions(model, actions, expected, 1e-7)
+    assert_same_actions(model, actions, expected)
     np.testing.assert_allclose(values, model.policy.q_values(observations).numpy(), rtol=1e-6, atol=1e-6)
     singles = [session.run(["action"], {"observation": observations[i : i + 1]})[0] for i in range(100)]
     np.testing.assert_array_equal(np.concatenate(singles), actions[:100])
@@ -367,7 +370,7 @@ def acts(program: Callable[[th.Tensor], th.Tensor], model: Model, n: int = 2_000
     actions = program(th.from_numpy(observations)).numpy()
     assert actions.dtype == expected.dtype
     assert actions.shape == expected.shape
-    assert_same_actions(model, actions, expected, 1e-7)
+    assert_same_actions(model, actions, expected)
     for i in range(20):
         np.testing.assert_array_equal(program(th.from_numpy(observations[i : i + 1])).numpy(), actions[i : i + 1])
 
