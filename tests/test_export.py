@@ -264,7 +264,12 @@ def test_c_computes_in_single_precision(name: str, tmp_path: Path) -> None:
     # Which points are the nearest is a matter of the last digit on points and halfway between them.
     usual = slice(len(observations) // 10, None)
     np.testing.assert_allclose(values[usual], expected[usual], rtol=1e-3, atol=1e-3 * np.abs(expected).max())
-    assert (np.abs(actions - actions_as_rows(model, observations)) < 1e-3)[usual].mean() > 0.99
+    agree = (np.abs(actions - actions_as_rows(model, observations)) < 1e-3)[usual].all(axis=1)
+    # Between values that are equal to the last digit either action can be taken.
+    differ = np.ptp(expected[usual], axis=1) > 1e-4 * np.abs(expected).max()
+    assert differ.mean() > 0.3
+    assert agree[differ].mean() > 0.99
+    assert agree.mean() > 0.95
 
 
 @needs_compiler
