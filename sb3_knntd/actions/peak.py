@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import torch as th
 
 from sb3_knntd.actions.columns import ActionColumns
 from sb3_knntd.actions.exploration import EpsilonGreedy, greedy
 from sb3_knntd.actions.rules import Rules
-from sb3_knntd.actions.selection import MeanValueSelector, mean_rows
+from sb3_knntd.actions.selection import MeanValueSelector
 from sb3_knntd.kernels.selection import Target
 
 #: Parabolas that are flatter than this, relative to their values, have no peak.
 LEAST_CURVATURE = 1e-12
+
+
+def columns_beside(columns: ActionColumns) -> np.ndarray:
+    """
+    :param columns: the action points, one column for every combination
+    :return: the columns below and above each column in each dimension, itself at the ends, shape
+        (action_dim, 2, n_columns), int64
+    """
+    shape = [len(points) for points in columns.lists]
+    places = np.indices(shape).reshape(len(shape), -1)
+    beside = np.empty((len(shape), 2, len(columns.points)), np.int64)
+    for dimension, side in np.ndindex(len(shape), 2):
+        shifted = places.copy()
+        shifted[dimension] += 2 * side - 1
+        beside[dimension, side] = np.ravel_multi_index(tuple(shifted), shape, mode="clip")
+    return beside
 
 
 class PeakSelector(MeanValueSelector):
@@ -26,26 +44,14 @@ class PeakSelector(MeanValueSelector):
     :param rules: where columns are forbidden; nowhere by default
     """
 
+    interpolates: ClassVar[bool] = True
+
     def __init__(self, columns: ActionColumns, random_ties: bool, rules: Rules | None = None) -> None:
         super().__init__(columns, Target.Q_LEARNING, EpsilonGreedy(), random_ties, rules)
         if self.n_factors != 1:
             raise ValueError("action_table must be 'joint': a column for every combination of action points")
-        shape = [len(points) for points in columns.lists]
-        numbers = np.arange(len(columns.points)).reshape(shape)
-        places = np.stack(np.unravel_index(np.arange(len(columns.points)), shape), axis=1)
-        sides = [
-            [self._shifted(numbers, places, dimension, step) for step in (-1, 1)] for dimension in range(len(shape))
-        ]
-        #: the columns below and above each column in each dimension, itself at the ends, (action_dim, 2, n_columns)
-        self._sides = th.from_numpy(np.array(sides))
+        self._sides = th.from_numpy(columns_beside(columns))
         self._points = th.from_numpy(columns.points)
-
-    @staticmethod
-    def _shifted(numbers: np.ndarray, places: np.ndarray, dimension: int, step: int) -> np.ndarray:
-        shifted = places.copy()
-        shifted[:, dimension] = np.clip(shifted[:, dimension] + step, 0, numbers.shape[dimension] - 1)
-        columns: np.ndarray = numbers[tuple(shifted.T)]
-        return columns
 
     def peak(self, values: th.Tensor, best: th.Tensor) -> th.Tensor:
         """
@@ -75,7 +81,8 @@ class PeakSelector(MeanValueSelector):
         return actions
 
     def greedy_actions(self, rows: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
-        values = mean_rows(rows, probabilities)
+        # Added one after the other: columns that are equal in all rows stay equal, whatever the number of columns.
+        values = (probabilities[..., None] * rows).cumsum(dim=1)[:, -1]
         return self.peak(values, greedy(values))
 
     def actions_of(self, action_indices: th.Tensor, probabilities: th.Tensor) -> th.Tensor:

@@ -57,6 +57,8 @@ class ActionSelector(ABC):
     _GREEDY_EXPLORATION: ClassVar[Exploration]
     target = Target.SARSA
     exploration: Exploration
+    #: whether greedy actions are peaks between the action points, see :class:`~sb3_knntd.actions.peak.PeakSelector`
+    interpolates: ClassVar[bool] = False
     min_persistence = 1.0
     persistence_share = 0.0
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_knntd.actions.peak import LEAST_CURVATURE
 from sb3_knntd.common.checks import check_word, in_bytes
 from sb3_knntd.common.files import replace_file
 from sb3_knntd.export import c_templates as templates
@@ -32,6 +33,8 @@ WEIGHTS = {
     Weighting.INVERSE_QUADRATIC: "$one / ($one + square / $h2)",
     Weighting.GAUSSIAN: "exp$f(-(square - nearest) / $twice_h2)",
 }
+#: The last parameter of functions that compare columns, with rules.
+FORBIDDEN_PARAMETER = ", const unsigned char *forbidden"
 
 
 def write_c(policy: Exportable, path: Path, *, precision: str = "double", rows: str = "auto") -> list[Path]:
@@ -196,7 +199,7 @@ class _Code:
             act=self._act(),
             rules=self._rules(),
             allowed_only=" that is allowed" if len(frozen.rules) else "",
-            forbidden_parameter=", const unsigned char *forbidden" if len(frozen.rules) else "",
+            forbidden_parameter=FORBIDDEN_PARAMETER if len(frozen.rules) else "",
             better=templates.BETTER_ALLOWED if len(frozen.rules) else templates.BETTER,
         )
 
@@ -251,6 +254,7 @@ class _Code:
         factors = frozen.columns.factors.tolist()
         of_actions = frozen.combination is Combination.OF_ACTIONS
         single = n_actions == 1
+        peak = self._peak() if frozen.interpolates else ""
         whole = np.issubdtype(space.dtype, np.integer)
         act = self.fill(
             templates.ACT_BOX,
@@ -258,8 +262,23 @@ class _Code:
             scope="static void" if single else "void",
             function="act" if single else f"{self.name}_action",
             choice=self.fill(
-                templates.OF_ACTIONS if of_actions else templates.OF_VALUES, factors=", ".join(map(str, factors))
+                templates.OF_ACTIONS if of_actions else templates.OF_VALUES,
+                factors=", ".join(map(str, factors)),
+                peak=f" + peak_offset(values, best, j{self.common['forbidden']})" if frozen.interpolates else "",
             ).rstrip(),
             rounding=f"        action[j] = rint{self.f}(action[j]);\n" if whole else "",
         )
-        return points + act + (self.fill(templates.ACT_SINGLE) if single else "")
+        return points + peak + act + (self.fill(templates.ACT_SINGLE) if single else "")
+
+    def _peak(self) -> str:
+        counts = [len(points) for points in self.frozen.columns.lists]
+        ruled = len(self.frozen.rules) > 0
+        return self.fill(
+            templates.PEAK,
+            counts=", ".join(map(str, counts)),
+            steps=", ".join(str(prod(counts[j + 1 :])) for j in range(len(counts))),
+            least=self.number(LEAST_CURVATURE),
+            half=self.number(0.5),
+            forbidden_parameter=FORBIDDEN_PARAMETER if ruled else "",
+            forbidden_beside=templates.FORBIDDEN_BESIDE if ruled else "",
+        )

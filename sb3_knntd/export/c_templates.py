@@ -341,7 +341,7 @@ OF_VALUES = """
     ${name}_q_values(observation, values);
     best = best_column(values, 0, N_COLUMNS$forbidden);
     for (j = 0; j < ACTION_SIZE; ++j)
-        action[j] = action_points[best][j];
+        action[j] = action_points[best][j]$peak;
 """
 
 OF_ACTIONS = """
@@ -364,6 +364,38 @@ OF_ACTIONS = """
             action[j] += weights[i] * selected[j];
     }
 """
+
+PEAK = """
+/* The number of action points in each dimension, and of columns from one to the next. */
+static const int n_points_of[ACTION_SIZE] = {$counts};
+static const int step_of[ACTION_SIZE] = {$steps};
+
+/* How far the peak of the parabola through the values of an action point and of those next to it in dimension j is from
+ * it, at most half of the way to the next; 0 where there is no peak. */
+static real peak_offset(const real *values, int best, int j$forbidden_parameter)
+{
+    const int step = step_of[j], place = best / step % n_points_of[j];
+    const int below = best - step, above = best + step;
+    real left, right, slope_left, slope_right, curvature, offset, magnitude;
+    if (place == 0 || place == n_points_of[j] - 1$forbidden_beside)
+        return $zero;
+    left = action_points[best][j] - action_points[below][j];
+    right = action_points[above][j] - action_points[best][j];
+    slope_left = (values[best] - values[below]) / left;
+    slope_right = (values[above] - values[best]) / right;
+    curvature = (slope_right - slope_left) / (left + right);
+    magnitude = fabs$f(values[best]) > $one ? fabs$f(values[best]) : $one;
+    if (!(curvature * ((left + right) * (left + right)) < -$least * magnitude))
+        return $zero;
+    offset = -$half * ((slope_left * right + slope_right * left) / (left + right)) / curvature;
+    if (offset > $half * right)
+        return $half * right;
+    return offset > -$half * left ? offset : -$half * left;
+}
+"""
+
+#: What else lets an action point have no peak, with rules.
+FORBIDDEN_BESIDE = " || forbidden[below] || forbidden[above]"
 
 ACT_BOX = """
 $n_factors

@@ -69,6 +69,8 @@ class FrozenPolicy:
     :param visits: for each row, 0 if learning has not updated it, shape (n_rows,), int32
     :param initial_value: value of points without a row
     :param combination: whether the mean of the rows selects one action, or each row one, whose mean is taken
+    :param interpolates: whether the action that is selected moves to the peak of a parabola through the values of the
+        action points next to it, see :class:`~sb3_knntd.actions.peak.PeakSelector`
     :param columns: the actions that the columns of the table stand for
     :param rules: where actions are forbidden
     """
@@ -86,6 +88,7 @@ class FrozenPolicy:
     visits: np.ndarray
     initial_value: float
     combination: Combination
+    interpolates: bool
     columns: ActionColumns
     rules: Rules
 
@@ -105,8 +108,11 @@ class FrozenPolicy:
         :param observation_space: Box of shape (obs_dim,), Discrete, MultiDiscrete or MultiBinary
         :param action_space: Discrete or Box
         :return: a copy of what they do now
+        :raises ValueError: if there are no points
         """
         bounds, points = perceiver.bounds, perceiver.points
+        if not points.n_points:
+            raise ValueError("the policy has no points yet, they grow while it learns: call learn before export")
         lattice = points if isinstance(points, Lattice) else None
         with table.lock:
             values, visits = (tensor.cpu().numpy().copy() for tensor in (table.entries(), table.counts()))
@@ -123,12 +129,13 @@ class FrozenPolicy:
                 lattice=lattice,
                 places=None if lattice else points.coordinates(bounds).cpu().numpy(),
                 n_neighbors=min(perceiver.search.n_neighbors, points.n_points),
-                weights=perceiver.weights,
+                weights=copy.copy(perceiver.weights),
                 values=values,
                 row_points=None if rows is None else numbers,
                 visits=visits,
                 initial_value=table.initial_value,
                 combination=Combination(selector.kernel_arguments(greedy=True).combination),
+                interpolates=selector.interpolates,
                 columns=selector.columns,
                 rules=copy.deepcopy(selector.rules).cpu(),
             )

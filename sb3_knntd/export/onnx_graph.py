@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_knntd.actions.peak import LEAST_CURVATURE, columns_beside
 from sb3_knntd.common.checks import in_bytes
 from sb3_knntd.common.files import replace_file
 from sb3_knntd.export.frozen import Exportable, FrozenPolicy
@@ -239,6 +240,41 @@ def _best(graph: _Graph, values: str, axis: int) -> str:
     return graph("ArgMax", values, axis=axis, keepdims=0, select_last_index=0)
 
 
+def _peak_offsets(graph: _Graph, frozen: FrozenPolicy, values: str, best: str) -> str:
+    """
+    How far the peak of the parabola through the values of the best column and those beside it is from it in each
+    dimension, see :class:`~sb3_knntd.actions.peak.PeakSelector`, shape (batch, action_dim).
+    """
+    points, offsets = frozen.columns.points, []
+
+    def of_best(of_columns: np.ndarray, dtype: Any = np.float64) -> str:
+        """A number of the best column, shape (batch, 1)."""
+        return graph("Unsqueeze", graph("Gather", graph.constant(of_columns, dtype), best, axis=0), graph.numbers(1))
+
+    middle = graph("GatherElements", values, graph("Unsqueeze", best, graph.numbers(1)), axis=1)
+    size = graph("Max", graph("Abs", middle), graph.constant(1.0))
+    for dimension, (below, above) in enumerate(columns_beside(frozen.columns)):
+        to_left = points[:, dimension] - points[below, dimension]
+        to_right = points[above, dimension] - points[:, dimension]
+        left, right, width = of_best(to_left), of_best(to_right), of_best(to_left + to_right)
+        low, high = (graph("GatherElements", values, of_best(columns, np.int64), axis=1) for columns in (below, above))
+        slope_left = graph("Div", graph("Sub", middle, low), left)
+        slope_right = graph("Div", graph("Sub", high, middle), right)
+        curvature = graph("Div", graph("Sub", slope_right, slope_left), width)
+        weighted = graph("Add", graph("Mul", slope_left, right), graph("Mul", slope_right, left))
+        slope = graph("Div", weighted, width)
+        offset = graph("Div", graph("Mul", graph.constant(-0.5), slope), curvature)
+        limited = graph("Max", offset, graph("Mul", graph.constant(-0.5), left))
+        limited = graph("Min", limited, graph("Mul", graph.constant(0.5), right))
+        bend = graph("Mul", curvature, graph("Mul", width, width))
+        curved = graph("Less", bend, graph("Mul", graph.constant(-LEAST_CURVATURE), size))
+        # At the ends, and beside forbidden columns, the parabola is not a number.
+        inner = graph("And", of_best((to_left > 0.0) & (to_right > 0.0), bool), graph("Not", graph("IsNaN", offset)))
+        has_peak = graph("And", inner, curved)
+        offsets.append(graph("Where", has_peak, limited, graph.constant(0.0)))
+    return graph("Concat", *offsets, axis=1)
+
+
 def _actions(
     graph: _Graph, frozen: FrozenPolicy, q_values: str, rows: str, shares: list[str], forbidden: str | None
 ) -> str:
@@ -253,7 +289,10 @@ def _actions(
     assert isinstance(space, spaces.Box)
     points = graph.constant(frozen.columns.points)
     if frozen.combination is Combination.OF_VALUES:
-        actions = graph("Gather", points, _best(graph, q_values, 1), axis=0)
+        best = _best(graph, q_values, 1)
+        actions = graph("Gather", points, best, axis=0)
+        if frozen.interpolates:
+            actions = graph("Add", actions, _peak_offsets(graph, frozen, q_values, best))
     else:
         selected = []
         for first, end in frozen.factor_ranges:

@@ -42,7 +42,8 @@ class ReadTable(nn.Module):
         :return: their values, shape (batch, k, n_columns)
         """
         if self.row_points is None:
-            return self.values[indices]
+            # Where there are fewer points than neighbours, the others have no row, and no weight.
+            return self.values[indices.clamp(max=self.n_rows - 1)]
         row = th.searchsorted(self.row_points, indices).clamp(max=self.n_rows - 1)
         return self.values[th.where(self.row_points[row] == indices, row, self.n_rows)]
 
