@@ -37,7 +37,7 @@ class PeakSelector(MeanValueSelector):
             [self._shifted(numbers, places, dimension, step) for step in (-1, 1)] for dimension in range(len(shape))
         ]
         #: the columns below and above each column in each dimension, itself at the ends, (action_dim, 2, n_columns)
-        self._sides = th.from_numpy(np.array(sides))
+        self.sides = th.from_numpy(np.array(sides))
         self._points = th.from_numpy(columns.points)
 
     @staticmethod
@@ -53,7 +53,7 @@ class PeakSelector(MeanValueSelector):
         :param best: the best columns, shape (batch,), int64
         :return: actions, shape (batch, action_dim), action units
         """
-        points, sides = self._points.to(values.device), self._sides.to(values.device)
+        points, sides = self._points.to(values.device), self.sides.to(values.device)
         actions = points[best].clone()
         middle = values.gather(1, best[:, None])[:, 0]
         for dimension in range(actions.shape[1]):

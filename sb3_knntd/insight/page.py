@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from sb3_knntd.actions.peak import LEAST_CURVATURE, PeakSelector
 from sb3_knntd.common.files import replacing
 from sb3_knntd.insight.diagnosis import TrainedModel, diagnose
 from sb3_knntd.insight.labels import column_names
@@ -133,6 +134,7 @@ def page_content(
         "isWhole": not isinstance(model.observation_space, spaces.Box),
         "seen": [experience.low.tolist(), experience.high.tolist()] if experience.n_steps else None,
         "limit": FARTHEST,
+        "leastCurvature": LEAST_CURVATURE,
         "k": policy.n_neighbors,
         **_weights(policy),
         **_points(policy),
@@ -200,6 +202,7 @@ def _table(policy: KNNPolicy) -> dict[str, Any]:
         "visits": _encoded(visits[told].astype(np.float64)),
         "initialValue": table.initial_value,
         "factors": policy.columns.factors.tolist(),
+        "averagesValues": policy.selector.averages_values,
     }
 
 
@@ -207,8 +210,10 @@ def _action_space(model: TrainedModel) -> dict[str, Any]:
     space = model.action_space
     if not isinstance(space, spaces.Box):
         return {"actionPoints": None}
+    selector = model.policy.selector
     return {
         "actionPoints": model.policy.columns.points.tolist(),
+        "sides": selector.sides.tolist() if isinstance(selector, PeakSelector) else None,
         "actionLow": space.low.reshape(-1).tolist(),
         "actionHigh": space.high.reshape(-1).tolist(),
         "actionIsWhole": bool(np.issubdtype(space.dtype, np.integer)),

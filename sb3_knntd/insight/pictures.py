@@ -63,8 +63,8 @@ def plot_explanation(
         fixed = {dim: float(observation[dim]) for dim in set(range(len(observation))) - set(dims)}
         for ax in plot_value_function(model, dims, fixed, axes=maps, names=names):
             _draw_neighbors(ax, observation, neighbors, dims)
-    # With continuous actions each neighbour chooses, and the mean values choose nothing.
-    chosen = int(q_values.argmax()) if isinstance(model.action_space, spaces.Discrete) else -1
+    # With Ex⟨a⟩ each neighbour chooses, and the mean values choose nothing.
+    chosen = int(q_values.argmax()) if model.policy.selector.averages_values else -1
     _draw_values(bars, q_values, neighbors, columns, chosen)
     bars.set_title(title, fontsize="medium")
     return tuple(axes)
