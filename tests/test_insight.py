@@ -179,6 +179,32 @@ def test_a_planned_table_is_inspected_from_its_file(env: str, tmp_path: Path) ->
     assert f"<title>KNNDyna on {env}</title>" in (tmp_path / "model.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("case", ["lattice", "continuous", "factored", "planned continuous"])
+def test_forbidden_actions_are_not_explained_as_the_best(
+    case: str, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plotly.offline.get_plotlyjs", lambda: NO_PLOTLY)
+    cls, env, arguments = MODELS[case]
+    model = cls(env, seed=0, **arguments).learn(300)
+    bounds = model.policy.perceiver.bounds
+    observation = 0.5 * (bounds.low + bounds.high).numpy()
+    observation = observation.astype(np.float32).astype(np.float64)
+    region = {0: (-np.inf, float(observation[0]))}
+    action = model.predict(observation)[0]
+    model.policy.forbid(int(action) if case == "lattice" else {0: (float(action[0]) - 0.6, 10.0)}, region)
+    explanation = model.explain(observation)
+    assert np.isneginf(explanation.q_values).any()
+    expected = model.predict(observation)[0]
+    assert not np.array_equal(expected, action)
+    np.testing.assert_array_equal(explanation.action, expected)
+    assert np.isfinite(explanation.value)
+    assert explanation.margin >= 0.0
+    explanation.plot()
+    write_page(model, tmp_path / "page.html")
+    page, _ = opened(browser, tmp_path / "page.html")
+    np.testing.assert_allclose(page.evaluate("state => read(state).action", observation.tolist()), expected, atol=1e-6)
+
+
 def test_the_text_of_an_explanation() -> None:
     model = KNNTD("MountainCar-v0", seed=0, points=10).learn(3_000)
     text = str(model.explain(np.array([-0.4, 0.01])))

@@ -34,7 +34,7 @@ class Explanation:
         action point, and the action is the peak of a parabola near it
     :param margin: how much the second best action is worse: of Q(s, ·), for Ex⟨a⟩ the mean over the neighbours (and
         action dimensions); infinite if there is one action only
-    :param q_values: Q(s, ·) = Σ p(i) Q(i, ·), shape (n_columns,)
+    :param q_values: Q(s, ·) = Σ p(i) Q(i, ·), shape (n_columns,); -inf where an action is forbidden
     :param neighbors: the k nearest points, nearest first
     :param beyond_bounds: dimensions in which the observation is beyond the bounds
     :param beyond_seen: dimensions in which it is beyond all observations that were learned from
@@ -152,6 +152,7 @@ def explain(model: TableModel, observation: np.ndarray, names: Names | None = No
         selector = policy.selector
         value = float(selector.greedy_value(rows, probabilities)[0])
         q_values = policy.q_values(batch)[0].double().cpu().numpy()
+        q_values[policy.rules.forbidden(th.as_tensor(batch))[0].cpu().numpy()] = -np.inf
         visits = policy.table.counts_at(perception.indices)[0]
         bounds, experience = policy.perceiver.bounds, policy.experience
         places = bounds.unscale(policy.perceiver.points.coordinates(bounds, perception.indices[0]))

@@ -137,6 +137,7 @@ def page_content(
         "leastCurvature": LEAST_CURVATURE,
         "k": policy.n_neighbors,
         **_weights(policy),
+        "rules": _rules(policy),
         **_points(policy),
         **_table(policy),
         **_action_space(model),
@@ -169,6 +170,21 @@ def _weights(policy: KNNPolicy) -> dict[str, Any]:
             "weights: a page can be made of a model with named weights only; those of this one are a function"
         )
     return {"weighting": weights.WEIGHTING.name.lower(), "bandwidth": weights.bandwidth}
+
+
+def _rules(policy: KNNPolicy) -> list[dict[str, Any]]:
+    """Where columns are forbidden; JSON has no infinity."""
+    rules = policy.rules
+    return [
+        {
+            "low": np.nan_to_num(low).tolist(),
+            "high": np.nan_to_num(high).tolist(),
+            "columns": np.flatnonzero(columns).tolist(),
+        }
+        for low, high, columns in zip(
+            *(part.cpu().numpy() for part in (rules.low, rules.high, rules.columns)), strict=True
+        )
+    ]
 
 
 def _points(policy: KNNPolicy) -> dict[str, Any]:

@@ -100,11 +100,22 @@ def _draw_values(
     axes: Axes, values: np.ndarray, neighbors: Sequence[Neighbor], columns: Sequence[str], chosen: int
 ) -> None:
     places = np.arange(len(values))
-    axes.hlines(places, min(values.min(), *(each.values.min() for each in neighbors)), values, color="0.85")
+    # Forbidden actions have the value -inf, and are not drawn.
+    allowed = np.isfinite(values)
+    lowest = min(values[allowed].min(), *(each.values[allowed].min() for each in neighbors))
+    axes.hlines(places[allowed], lowest, values[allowed], color="0.85")
     for neighbor in neighbors:
         size = 24 * np.sqrt(neighbor.probability)
-        axes.plot(neighbor.values, places, "o", color=LINE_COLOR, alpha=0.35, markersize=size, markeredgewidth=0)
-    for place, value in enumerate(values):
+        axes.plot(
+            neighbor.values[allowed],
+            places[allowed],
+            "o",
+            color=LINE_COLOR,
+            alpha=0.35,
+            markersize=size,
+            markeredgewidth=0,
+        )
+    for place, value in zip(places[allowed], values[allowed], strict=True):
         color = BASELINE_COLOR if place == chosen else "0.35"
         axes.plot(value, place, "|", color=color, markersize=22, markeredgewidth=3)
     axes.set_yticks(places, list(columns))
