@@ -21,12 +21,14 @@ from sb3_knntd.common.schedules import make_schedule
 from sb3_knntd.datasets import record
 from sb3_knntd.dyna_policies import BANDWIDTH, DynaBoxPolicy, DynaPolicy, policy_for
 from sb3_knntd.editing import actions_of
+from sb3_knntd.insight.diagnosis import Checklist
 from sb3_knntd.kernels.selection import Target
 from sb3_knntd.learners import Learner, Transitions
 from sb3_knntd.model import Prediction, TransitionBuffer
 from sb3_knntd.model.rewards import compiled_reward
 from sb3_knntd.perception.growing import Growth
 from sb3_knntd.planning import DynaLearner, LocalPlanner, Planner, PlanSettings, StatePlanner
+from sb3_knntd.planning.diagnosis import CHECKLIST
 from sb3_knntd.policies import KNNPolicy
 
 SelfKNNDyna = TypeVar("SelfKNNDyna", bound="KNNDyna")
@@ -85,6 +87,7 @@ class KNNDyna(KNNAlgorithm):
     """
 
     learner: DynaLearner
+    checklist: ClassVar[Checklist] = CHECKLIST
     _refinable: ClassVar[tuple[str, ...]] = ()
     buffer_size: Any = FixedHyperparameter()
     action_points: Any = FixedHyperparameter()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,9 @@ BANDWIDTH = 0.7
 
 
 class SpacedPolicy(KNNPolicy):
-    """A policy whose bandwidth follows the spacing of points that grow."""
+    """
+    A policy whose bandwidth follows the spacing of points that grow, and whose values are planned: they cannot be set.
+    """
 
     @property
     def bandwidth(self) -> float:
@@ -33,6 +36,44 @@ class SpacedPolicy(KNNPolicy):
         if isinstance(points, GrowingPoints) and isinstance(weights, KernelWeights):
             weights.bandwidth = BANDWIDTH * float(points.spacing)
             self.perceiver.fit()
+
+    def set_q(self, observation: np.ndarray, action: Any, value: Any) -> None:
+        """
+        Raises an error: the values are planned.
+
+        :param observation: has no effect
+        :param action: has no effect
+        :param value: has no effect
+        :raises ValueError: always
+        """
+        raise self._planned("set_q")
+
+    def fill(self, function: Callable[[np.ndarray], Any]) -> None:
+        """
+        Raises an error: the values are planned.
+
+        :param function: has no effect
+        :raises ValueError: always
+        """
+        raise self._planned("fill")
+
+    def imitate(self, controller: Any, margin: float | None = None) -> None:
+        """
+        Raises an error: the values are planned. ``model.imitate`` learns the model from a controller's steps.
+
+        :param controller: has no effect
+        :param margin: has no effect
+        :raises ValueError: always
+        """
+        raise self._planned("imitate")
+
+    @staticmethod
+    def _planned(method: str) -> ValueError:
+        return ValueError(
+            f"{method} has no place in KNNDyna: the next plan would overwrite what it sets. Teach the model by "
+            "model.learn_from(data) or model.imitate(controller), give a reward_function, or forbid actions by "
+            "policy.forbid"
+        )
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
         answer = super().load_state_dict(state_dict, strict, assign)

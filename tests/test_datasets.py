@@ -18,7 +18,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 
 Act = Callable[[np.ndarray, np.random.Generator], Any]
 Steps = list[tuple[np.ndarray, Any, float, np.ndarray, bool, bool]]
@@ -209,6 +209,22 @@ def test_normalised_environments() -> None:
     assert (high - low < 2.0 * np.ptp(scaled, axis=0)).all()
 
 
+def test_a_planner_learns_the_same_from_every_form(steps: Steps, tmp_path: pathlib.Path) -> None:
+    log = as_log(steps)
+    np.savez(tmp_path / "log.npz", **log)
+    models = [
+        KNNDyna("CartPole-v1", seed=0, simulated_steps=5).learn_from(dataset, passes=2)
+        for dataset in (log, tmp_path / "log.npz")
+    ]
+    assert models[0].learner.planner.n_transitions == len(steps)
+    np.testing.assert_array_equal(models[0].policy.q_table, models[1].policy.q_table)
+    model = models[0].learn(100)
+    assert model.learner.planner.n_transitions == len(steps) + 100
+    with pytest.raises(ValueError, match="actions must be from 0 to 1"):
+        model.learn_from({**log, "actions": log["actions"] + 5})
+    assert model.learner.planner.n_transitions == len(steps) + 100
+
+
 def test_learning_goes_on_after_data(steps: Steps) -> None:
     model = KNNTD("CartPole-v1", points=5, seed=0).learn_from(as_log(steps))
     bounds, visited = model.policy.perceiver.bounds.low.clone(), model.policy.table.n_visited
@@ -269,6 +285,7 @@ TASKS = [
     ("CartPole-v1", turning, KNNTD, {}, 20_000),
     pytest.param("Pendulum-v1", any_torque, ExA, {}, 20_000, marks=pytest.mark.slow),
     ("Pendulum-v1", swing, ExA, {}, 20_000),
+    ("Pendulum-v1", any_torque, KNNDyna, {"simulated_steps": 20}, 1_000),
     pytest.param("Tank-v0", any_opening, ExA, {"gamma": 0.9}, 20_000, marks=pytest.mark.slow),
     ("Tank-v0", fill, ExA, {"gamma": 0.9}, 20_000),
 ]
@@ -276,7 +293,7 @@ TASKS = [
 
 @pytest.mark.parametrize(("env_id", "act", "algorithm", "arguments", "n"), TASKS)
 def test_the_learned_policy_beats_the_one_that_made_the_data(
-    env_id: str, act: Act, algorithm: type[KNNTD | ExA], arguments: dict[str, Any], n: int
+    env_id: str, act: Act, algorithm: type[KNNTD | ExA | KNNDyna], arguments: dict[str, Any], n: int
 ) -> None:
     steps, mean_return = walk(env_id, act, n)
     model = algorithm(env_id, seed=0, **arguments).learn_from(as_log(steps))

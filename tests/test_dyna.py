@@ -197,6 +197,28 @@ def test_learn_from_transitions():
     assert learned > random + 500
 
 
+def test_the_model_is_learned_from_the_steps_of_a_controller(capsys):
+    def controller(observation):
+        return int(observation[2] + observation[3] > 0.0)
+
+    model = KNNDyna("CartPole-v1", seed=0, simulated_steps=20, verbose=1)
+    assert model.imitate(controller, n_steps=400) is model
+    assert "The controller's mean return over 400 steps" in capsys.readouterr().out
+    assert model.learner.planner.n_transitions == 400
+    env = gym.make("CartPole-v1")
+    observation, _ = env.reset(seed=5)
+    for _ in range(20):
+        action = controller(observation)
+        prediction = model.predict_next(observation, action)
+        observation, reward, *_ = env.step(action)
+        assert prediction.observation == pytest.approx(observation, abs=0.02)
+        assert prediction.reward == pytest.approx(reward)
+    model.learn(100)
+    assert model.learner.planner.n_transitions == 500
+    with pytest.raises(ValueError, match="controller must be a function"):
+        model.imitate(3)
+
+
 def distance_cost(observation, action, next_observation):
     return -abs(next_observation[0] - 0.5) - 0.01 * abs(action[0])
 

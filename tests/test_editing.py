@@ -14,7 +14,7 @@ from gymnasium import spaces
 from recorded_runs import LENGTHS, make_venv
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 
 Model = KNNTD | ExA
 HASHED = {"policy_kwargs": {"table": "hashed"}}
@@ -93,6 +93,25 @@ def test_fill_names_what_is_wrong() -> None:
         KNNTD("CartPole-v1").policy.fill(lambda points: points[:, :1])
     with pytest.raises(ValueError, match="set_q"):
         make(points=100_000).policy.fill(lambda points: points[:, :1])
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
+def test_planned_values_cannot_be_set(env_id: str) -> None:
+    """The next plan would overwrite them."""
+    model = KNNDyna(env_id, seed=0, simulated_steps=0).learn(50)
+    before, observation = model.policy.q_table.clone(), model.observation_space.sample()
+    action = model.action_space.sample()
+    attempts = {
+        "set_q": lambda: model.policy.set_q(observation, action, 1.0),
+        "fill": lambda: model.policy.fill(lambda points: points[:, :1]),
+        "imitate": lambda: model.policy.imitate(lambda observation: action),
+    }
+    for name, attempt in attempts.items():
+        with pytest.raises(ValueError, match=rf"{name} .*next plan would overwrite .*learn_from.*forbid"):
+            attempt()
+    with pytest.raises(ValueError, match="smaller spacing"):
+        model.refine(points=10)
+    assert th.equal(model.policy.q_table, before)
 
 
 # --------------------------------------------------------------------- imitate
@@ -253,6 +272,26 @@ def test_forbidden_actions_are_never_taken(algorithm: type[Model], arguments: di
         tables.append(model.policy.q_table.numpy())
     np.testing.assert_allclose(*tables, rtol=1e-9, atol=1e-9)
     assert np.isfinite(tables[0]).all()
+
+
+@pytest.mark.parametrize(("env_id", "action"), [("MountainCar-v0", 2), ("MountainCarContinuous-v0", {0: (0.5, 1.0)})])
+def test_forbidden_actions_are_never_planned(env_id: str, action: Any, tmp_path: pathlib.Path) -> None:
+    model = KNNDyna(env_id, seed=0, action_points=5, simulated_steps=10)
+    model.policy.forbid(action, {0: (-np.inf, -0.5)})
+    taken = Taken()
+    model.learn(300, callback=taken)
+    model.save(tmp_path / "model")
+    loaded = KNNDyna.load(tmp_path / "model")
+    states = np.random.default_rng(0).uniform([-1.2, -0.07], [0.6, 0.07], (200, 2)).astype(np.float32)
+    chosen = [each.predict(states, deterministic=True)[0] for each in (model, loaded)]
+    chosen.append(np.array([model.predict(state)[0] for state in states]))
+    inside = [taken.inside(0, -np.inf, -0.5), *(each[states[:, 0] <= -0.5] for each in chosen)]
+    # Halfway to an action point that is forbidden is not allowed either.
+    limit = 2 if env_id == "MountainCar-v0" else 0.5
+    assert len(inside[0]) > 20
+    assert all((each < limit).all() for each in inside)
+    assert (taken.inside(0, -0.49, np.inf) >= limit).any()
+    assert len(loaded.policy.rules) == 1
 
 
 def test_a_rule_applies_from_the_next_action_on() -> None:

@@ -17,7 +17,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from stable_baselines3.common.monitor import Monitor
 from toy_envs import DriftEnv, PushEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 from sb3_knntd.cli import main
 from sb3_knntd.insight import Diagnosis, read_monitor, write_page
 from sb3_knntd.insight.diagnosis import LEAST_STEPS
@@ -136,6 +136,73 @@ def test_an_explanation_of_a_continuous_action(action_table: str) -> None:
     assert explanation.margin == pytest.approx(np.dot(weights, gaps))
     assert len(explanation.columns) == (7 if action_table == "factored" else 12)
     assert "action[0] = " in str(explanation)
+
+
+@pytest.mark.parametrize(
+    ("env", "observation"),
+    [
+        ("Pendulum-v1", [np.cos(2.0), np.sin(2.0), 1.0]),
+        (PushEnv(shape=(2,)), [-0.4, 0.01]),
+        ("CartPole-v1", [0.01, 0.1, 0.02, -0.1]),
+        ("FrozenLake-v1", 4),
+    ],
+)
+def test_an_explanation_of_a_planned_action(env: Any, observation: Any) -> None:
+    model = KNNDyna(env, seed=0, action_points=5, simulated_steps=20).learn(400)
+    seen = np.array(observation, model.observation_space.dtype)
+    explanation = model.explain(seen)
+    action = model.predict(seen, deterministic=True)[0]
+    np.testing.assert_array_equal(explanation.action, action)
+    means = sum(each.probability * each.values for each in explanation.neighbors)
+    np.testing.assert_allclose(explanation.q_values, means)
+    second, best = np.sort(explanation.q_values)[-2:]
+    assert explanation.value == pytest.approx(best)
+    assert explanation.margin == pytest.approx(best - second)
+    named = [f"{number:.4g}" for number in np.atleast_1d(action)]
+    assert all(number in str(explanation).splitlines()[1] for number in named) or env == "CartPole-v1"
+    *_, bars = explanation.plot()
+    assert explanation.action_text in bars.get_title()
+    # The bar of the best action, or action point, is marked.
+    marked = [line.get_xdata()[0] for line in bars.lines if line.get_marker() == "|" and line.get_color() != "0.35"]
+    assert marked == [pytest.approx(best)]
+    if isinstance(model.action_space, spaces.Box):
+        # The peak is not farther from the best action point than half of the way to the next.
+        points = model.policy.columns.points
+        halves = [0.5 * np.diff(np.unique(points[:, dim])).max() for dim in range(points.shape[1])]
+        assert (np.abs(action - points[explanation.q_values.argmax()]) <= np.array(halves) + 1e-6).all()
+
+
+@pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1"])
+def test_a_planned_table_is_inspected_from_its_file(env: str, tmp_path: Path) -> None:
+    KNNDyna(env, seed=0, simulated_steps=10).learn(100).save(tmp_path / "model.zip")
+    assert main(["inspect", str(tmp_path / "model.zip"), "--env", env]) == 0
+    assert f"<title>KNNDyna on {env}</title>" in (tmp_path / "model.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("case", ["lattice", "continuous", "factored", "planned continuous"])
+def test_forbidden_actions_are_not_explained_as_the_best(
+    case: str, browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plotly.offline.get_plotlyjs", lambda: NO_PLOTLY)
+    cls, env, arguments = MODELS[case]
+    model = cls(env, seed=0, **arguments).learn(300)
+    bounds = model.policy.perceiver.bounds
+    observation = 0.5 * (bounds.low + bounds.high).numpy()
+    observation = observation.astype(np.float32).astype(np.float64)
+    region = {0: (-np.inf, float(observation[0]))}
+    action = model.predict(observation)[0]
+    model.policy.forbid(int(action) if case == "lattice" else {0: (float(action[0]) - 0.6, 10.0)}, region)
+    explanation = model.explain(observation)
+    assert np.isneginf(explanation.q_values).any()
+    expected = model.predict(observation)[0]
+    assert not np.array_equal(expected, action)
+    np.testing.assert_array_equal(explanation.action, expected)
+    assert np.isfinite(explanation.value)
+    assert explanation.margin >= 0.0
+    explanation.plot()
+    write_page(model, tmp_path / "page.html")
+    page, _ = opened(browser, tmp_path / "page.html")
+    np.testing.assert_allclose(page.evaluate("state => read(state).action", observation.tolist()), expected, atol=1e-6)
 
 
 def test_the_text_of_an_explanation() -> None:
@@ -327,6 +394,55 @@ def test_a_tuned_run_has_no_finding(name: str, env: str, tmp_path: Path) -> None
     assert str(diagnosis).endswith("Nothing was found.")
 
 
+@pytest.mark.parametrize(
+    ("env", "steps"),
+    [("Pendulum-v1", 1_500), ("CartPole-v1", 2_000), ("MountainCarContinuous-v0", 2_000), ("FrozenLake-v1", 2_000)],
+)
+def test_an_ordinary_run_of_a_planner_has_no_finding(env: str, steps: int) -> None:
+    diagnosis = KNNDyna(env, seed=0).learn(steps).diagnose()
+    assert str(diagnosis).endswith("Nothing was found.")
+    assert diagnosis.n_steps == steps
+
+
+class Hidden(gym.ObservationWrapper[Any, Any, Any]):
+    """Pendulum without its velocity."""
+
+    def __init__(self) -> None:
+        super().__init__(gym.make("Pendulum-v1"))
+        self.observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def observation(self, observation: Any) -> Any:
+        return observation[:2]
+
+
+NARROW = ([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0])
+PLANNING_FAILURES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "a hidden state": ("model_error", "env", {"env": Hidden}),
+    "no reward": ("same_rewards", "optimism", {"env": lambda: Rewards(0.0)}),
+    "narrow bounds": ("beyond_bounds", "bounds", {"bounds": NARROW}),
+    "few points": ("max_points", "max_points", {"max_points": 60}),
+    "a short horizon": ("saturated", "gamma", {"env": lambda: gym.make("MountainCar-v0"), "gamma": 0.8}),
+}
+
+
+@pytest.mark.parametrize("case", PLANNING_FAILURES)
+def test_what_fails_in_planning_is_found(case: str) -> None:
+    name, parameter, arguments = PLANNING_FAILURES[case]
+    arguments = dict(arguments)
+    env = arguments.pop("env", lambda: gym.make("Pendulum-v1"))()
+    model = KNNDyna(env, seed=0, simulated_steps=10, **arguments).learn(999)
+    assert len(model.diagnose()) == 0
+    assert "Too few steps for a diagnosis: it takes 1,000." in str(model.diagnose())
+    diagnosis = model.learn(201, reset_num_timesteps=False).diagnose()
+    found = {finding.name: finding for finding in diagnosis}
+    assert name in found, str(diagnosis)
+    assert found[name].parameter == parameter
+    # Nothing that it has no parameter for, such as ε, a lattice or an initial value.
+    assert {finding.parameter for finding in diagnosis} <= {"env", "optimism", "bounds", "max_points", "gamma"}
+    if name == "beyond_bounds":
+        assert found[name].dims == (2,)
+
+
 def test_too_few_steps_tell_nothing() -> None:
     diagnosis = diagnosed(LEAST_STEPS - 1, bounds=([-1.2, -0.001], [0.6, 0.001]))
     assert len(diagnosis) == 0
@@ -375,7 +491,7 @@ def test_a_diagnosis_changes_nothing() -> None:
 
 # ------------------------------------------------------------------------------ the page
 
-MODELS: dict[str, tuple[type[KNNTD] | type[ExA], Any, dict[str, Any]]] = {
+MODELS: dict[str, tuple[type[KNNTD] | type[ExA] | type[KNNDyna], Any, dict[str, Any]]] = {
     "lattice": (KNNTD, "MountainCar-v0", {}),
     "four dimensions": (KNNTD, "CartPole-v1", {"weights": "gaussian", "bandwidth": 0.4}),
     "scattered": (KNNTD, "MountainCar-v0", {"points": SCATTERED}),
@@ -383,6 +499,9 @@ MODELS: dict[str, tuple[type[KNNTD] | type[ExA], Any, dict[str, Any]]] = {
     "continuous": (ExA, "Pendulum-v1", {"action_points": 5}),
     "factored": (ExA, PushEnv(shape=(2,)), {"action_points": [3, 4], "action_table": "factored"}),
     "states": (KNNTD, "FrozenLake-v1", {}),
+    "planned": (KNNDyna, "CartPole-v1", {"simulated_steps": 10}),
+    "planned continuous": (KNNDyna, "Pendulum-v1", {"simulated_steps": 10, "max_points": 200, "action_points": 5}),
+    "planned of two dimensions": (KNNDyna, PushEnv(shape=(2,)), {"simulated_steps": 10}),
 }
 
 
@@ -417,7 +536,7 @@ def test_the_page_computes_what_the_model_does(
     # What is drawn is tested below, and loading it takes seconds.
     monkeypatch.setattr("plotly.offline.get_plotlyjs", lambda: NO_PLOTLY)
     cls, env, arguments = MODELS[case]
-    model = cls(env, seed=0, **arguments).learn(2_500)
+    model = cls(env, seed=0, **arguments).learn(1_000 if cls is KNNDyna else 2_500)
     write_page(model, tmp_path / "page.html")
     page, _ = opened(browser, tmp_path / "page.html")
     if case == "states":

@@ -50,7 +50,8 @@ class PeakSelector(MeanValueSelector):
         super().__init__(columns, Target.Q_LEARNING, EpsilonGreedy(), random_ties, rules)
         if self.n_factors != 1:
             raise ValueError("action_table must be 'joint': a column for every combination of action points")
-        self._sides = th.from_numpy(columns_beside(columns))
+        #: the columns below and above each column in each dimension, itself at the ends, (action_dim, 2, n_columns)
+        self.sides = th.from_numpy(columns_beside(columns))
         self._points = th.from_numpy(columns.points)
 
     def peak(self, values: th.Tensor, best: th.Tensor) -> th.Tensor:
@@ -59,7 +60,7 @@ class PeakSelector(MeanValueSelector):
         :param best: the best columns, shape (batch,), int64
         :return: actions, shape (batch, action_dim), action units
         """
-        points, sides = self._points.to(values.device), self._sides.to(values.device)
+        points, sides = self._points.to(values.device), self.sides.to(values.device)
         actions = points[best].clone()
         middle = values.gather(1, best[:, None])[:, 0]
         for dimension in range(actions.shape[1]):

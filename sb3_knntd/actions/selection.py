@@ -73,6 +73,11 @@ class ActionSelector(ABC):
         return len(self.columns.factors) - 1
 
     @property
+    def averages_values(self) -> bool:
+        """Whether the mean values of the neighbours decide; if not, each neighbour decides by its own."""
+        return self._COMBINATION is Combination.OF_VALUES
+
+    @property
     def rate_is_temperature(self) -> bool:
         """Whether the rate of exploration is a temperature; if not, it is ε."""
         return self.exploration is Exploration.SOFTMAX

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, overload
+from typing import Any, ClassVar, NamedTuple, Protocol, overload
 
 import numpy as np
 from gymnasium import spaces
@@ -14,7 +14,7 @@ from sb3_knntd.perception import Lattice
 from sb3_knntd.plots import Names, names_for
 from sb3_knntd.policies import TableModel
 
-#: After fewer steps nothing is said.
+#: After fewer steps nothing is said of a table that is learned from each step.
 LEAST_STEPS = 5_000
 #: Share of the observations beyond the bounds of a dimension.
 MOST_BEYOND = 0.05
@@ -47,6 +47,8 @@ class TrainedModel(TableModel, Protocol):
     gamma: Any
     #: ε or the temperature at the last step
     exploration_rate: float
+
+    checklist: ClassVar[Checklist]
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class Diagnosis(Sequence[Finding]):
     :param n_points: number of points
     :param n_visited: number of points that were visited
     :param visits: median number of updates of a visited point
+    :param least_steps: number of steps that a diagnosis takes
     """
 
     findings: tuple[Finding, ...]
@@ -88,6 +91,7 @@ class Diagnosis(Sequence[Finding]):
     n_points: int
     n_visited: int
     visits: float
+    least_steps: int = LEAST_STEPS
 
     @overload
     def __getitem__(self, index: int) -> Finding: ...
@@ -108,12 +112,17 @@ class Diagnosis(Sequence[Finding]):
         )
         if self:
             return "\n".join([facts, *(f"- {finding}" for finding in self)])
-        few = f"Too few steps for a diagnosis: it takes {LEAST_STEPS:,}."
-        return f"{facts}\n{few if self.n_steps < LEAST_STEPS else 'Nothing was found.'}"
+        few = f"Too few steps for a diagnosis: it takes {self.least_steps:,}."
+        return f"{facts}\n{few if self.n_steps < self.least_steps else 'Nothing was found.'}"
 
 
-class _Case:
-    """What the checks look at."""
+class Case:
+    """
+    What the checks look at.
+
+    :param model: the model
+    :param names: names of the dimensions and actions
+    """
 
     def __init__(self, model: TrainedModel, names: Names) -> None:
         policy = model.policy
@@ -179,6 +188,20 @@ class _Case:
         return f"{self.seen_low[dim]:.3g} to {self.seen_high[dim]:.3g}"
 
 
+class Checklist(NamedTuple):
+    """
+    What an algorithm is checked for.
+
+    :param least_steps: number of steps that the checks take
+    :param checks: the checks, the most important first
+    :param at_once: those that are made after fewer steps
+    """
+
+    least_steps: int
+    checks: tuple[Callable[[Case], Iterator[Finding]], ...]
+    at_once: tuple[Callable[[Case], Iterator[Finding]], ...] = ()
+
+
 def diagnose(model: TrainedModel, names: Names | None = None) -> Diagnosis:
     """
     Look for what hinders learning. The names of the findings, and what each says:
@@ -198,22 +221,23 @@ def diagnose(model: TrainedModel, names: Names | None = None) -> Diagnosis:
     ``exploring``            ε is still above 0.1
     ======================== =========================================================================================
 
+    KNNDyna is checked for what hinders a model and planning, see :data:`sb3_knntd.planning.diagnosis.CHECKLIST`.
+
     :param model: the model
     :param names: names of the dimensions and actions; by default those of the environment, or numbers
-    :return: the findings; after fewer than 5,000 steps ``diverging`` only
+    :return: the findings; after fewer than 5,000 steps ``diverging`` only; KNNDyna: none after fewer than 1,000
     :raises ValueError: if ``names`` do not fit
     """
-    case = _Case(model, names_for(model, names))
-    n_steps = case.experience.n_steps
-    # Values that diverge need no more steps to be certain of.
-    checks = CHECKS if n_steps >= LEAST_STEPS else (_diverging,)
+    case = Case(model, names_for(model, names))
+    n_steps, checklist = case.experience.n_steps, model.checklist
+    checks = checklist.checks if n_steps >= checklist.least_steps else checklist.at_once
     findings = [finding for check in checks for finding in check(case)] if n_steps and len(case.visits) else []
     median = float(np.median(case.visits)) if len(case.visits) else 0.0
     n_points = model.policy.perceiver.points.n_points
-    return Diagnosis(tuple(findings), n_steps, n_points, len(case.visits), median)
+    return Diagnosis(tuple(findings), n_steps, n_points, len(case.visits), median, checklist.least_steps)
 
 
-def _diverging(case: _Case) -> Iterator[Finding]:
+def _diverging(case: Case) -> Iterator[Finding]:
     initial, (lowest, highest) = case.policy.table.initial_value, case.attainable
     least, most = min(0.0, initial, lowest), max(0.0, initial, highest)
     excess = max(float(case.values.max()) - most, least - float(case.values.min()), 0.0)
@@ -228,7 +252,11 @@ def _diverging(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _beyond_bounds(case: _Case) -> Iterator[Finding]:
+def beyond_bounds(case: Case) -> Iterator[Finding]:
+    """
+    :param case: what to look at
+    :return: dimensions in which many observations are beyond the bounds
+    """
     shares = case.experience.share_beyond.cpu().numpy()
     for dim in np.flatnonzero(case.has_range & (shares > MOST_BEYOND)).tolist():
         yield Finding(
@@ -241,7 +269,7 @@ def _beyond_bounds(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _unused_range(case: _Case) -> Iterator[Finding]:
+def _unused_range(case: Case) -> Iterator[Finding]:
     if not case.has_range or case.experience.n_steps < STEPS_FOR_SPAN:
         return
     # With two points or fewer every observation uses all of them.
@@ -259,7 +287,7 @@ def _unused_range(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _constant_dimension(case: _Case) -> Iterator[Finding]:
+def _constant_dimension(case: Case) -> Iterator[Finding]:
     for dim in np.flatnonzero(case.is_box & (case.span == 0) & np.isfinite(case.spacing)).tolist():
         yield Finding(
             "constant_dimension",
@@ -271,7 +299,7 @@ def _constant_dimension(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _useless_dimension(case: _Case) -> Iterator[Finding]:
+def _useless_dimension(case: Case) -> Iterator[Finding]:
     if not case.is_box or case.experience.n_steps < STEPS_FOR_EFFECT:
         return
     generator = np.random.default_rng(0)
@@ -300,7 +328,7 @@ def _useless_dimension(case: _Case) -> Iterator[Finding]:
             )
 
 
-def _initial_values(case: _Case) -> Iterator[Finding]:
+def _initial_values(case: Case) -> Iterator[Finding]:
     initial = case.policy.table.initial_value
     share = float(case.weights[(case.rows == initial).all(axis=1)].sum())
     if share > 1.0 - MOST_UNTRIED:
@@ -315,7 +343,7 @@ def _initial_values(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _optimism(case: _Case) -> Iterator[Finding]:
+def _optimism(case: Case) -> Iterator[Finding]:
     initial = case.policy.table.initial_value
     untried = np.zeros(len(case.rows), bool)
     for rows in case.factors:
@@ -340,7 +368,7 @@ def _optimism(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _too_coarse(case: _Case) -> Iterator[Finding]:
+def _too_coarse(case: Case) -> Iterator[Finding]:
     if not case.is_box:
         return
     moves = case.experience.mean_change.cpu().numpy() / case.spacing
@@ -357,7 +385,7 @@ def _too_coarse(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _too_fine(case: _Case) -> Iterator[Finding]:
+def _too_fine(case: Case) -> Iterator[Finding]:
     median = float(np.median(case.visits))
     if case.is_box and median < LEAST_VISITS:
         yield Finding(
@@ -369,7 +397,11 @@ def _too_fine(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _saturated(case: _Case) -> Iterator[Finding]:
+def saturated(case: Case) -> Iterator[Finding]:
+    """
+    :param case: what to look at
+    :return: a finding if most values are the worst ones that γ allows
+    """
     gamma, (lowest, _) = float(case.model.gamma), case.experience.rewards
     if gamma == 1.0 or lowest >= 0.0:
         return
@@ -386,7 +418,7 @@ def _saturated(case: _Case) -> Iterator[Finding]:
         )
 
 
-def _exploring(case: _Case) -> Iterator[Finding]:
+def _exploring(case: Case) -> Iterator[Finding]:
     epsilon = float(case.model.exploration_rate)
     if epsilon > MOST_EPSILON and not case.policy.selector.rate_is_temperature:
         yield Finding(
@@ -398,17 +430,21 @@ def _exploring(case: _Case) -> Iterator[Finding]:
         )
 
 
-#: The checks, the most important first.
-CHECKS = (
-    _diverging,
-    _beyond_bounds,
-    _unused_range,
-    _constant_dimension,
-    _useless_dimension,
-    _initial_values,
-    _optimism,
-    _too_coarse,
-    _too_fine,
-    _saturated,
-    _exploring,
+#: Of a table that is learned from each step. Values that diverge need no more steps to be certain of.
+TABLE_CHECKLIST = Checklist(
+    least_steps=LEAST_STEPS,
+    checks=(
+        _diverging,
+        beyond_bounds,
+        _unused_range,
+        _constant_dimension,
+        _useless_dimension,
+        _initial_values,
+        _optimism,
+        _too_coarse,
+        _too_fine,
+        saturated,
+        _exploring,
+    ),
+    at_once=(_diverging,),
 )

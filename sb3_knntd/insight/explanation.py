@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 
 from sb3_knntd.insight.labels import action_text, column_names
 from sb3_knntd.insight.neighbor import Neighbor
@@ -31,10 +30,11 @@ class Explanation:
 
     :param observation: the observation, shape (obs_dim,)
     :param action: the greedy action, as ``predict`` returns it
-    :param value: its value: max Q(s, ·), for Ex⟨a⟩ Σ p(i) max Q(i, ·)
+    :param value: its value: max Q(s, ·), for Ex⟨a⟩ Σ p(i) max Q(i, ·); for KNNDyna with Box actions that of the best
+        action point, and the action is the peak of a parabola near it
     :param margin: how much the second best action is worse: of Q(s, ·), for Ex⟨a⟩ the mean over the neighbours (and
         action dimensions); infinite if there is one action only
-    :param q_values: Q(s, ·) = Σ p(i) Q(i, ·), shape (n_columns,)
+    :param q_values: Q(s, ·) = Σ p(i) Q(i, ·), shape (n_columns,); -inf where an action is forbidden
     :param neighbors: the k nearest points, nearest first
     :param beyond_bounds: dimensions in which the observation is beyond the bounds
     :param beyond_seen: dimensions in which it is beyond all observations that were learned from
@@ -152,6 +152,7 @@ def explain(model: TableModel, observation: np.ndarray, names: Names | None = No
         selector = policy.selector
         value = float(selector.greedy_value(rows, probabilities)[0])
         q_values = policy.q_values(batch)[0].double().cpu().numpy()
+        q_values[policy.rules.forbidden(th.as_tensor(batch))[0].cpu().numpy()] = -np.inf
         visits = policy.table.counts_at(perception.indices)[0]
         bounds, experience = policy.perceiver.bounds, policy.experience
         places = bounds.unscale(policy.perceiver.points.coordinates(bounds, perception.indices[0]))
@@ -207,7 +208,7 @@ def _beyond(seen: np.ndarray, low: th.Tensor, high: th.Tensor, bounds: Bounds) -
 
 def _margin(model: TableModel, q_values: np.ndarray, neighbors: tuple[Neighbor, ...]) -> float:
     """How much the second best action is worse than the best."""
-    if isinstance(model.action_space, spaces.Discrete):
+    if model.policy.selector.averages_values:
         return _gap(q_values)
     ranges = model.policy.selector.factor_ranges
     gaps = [sum(_gap(each.values[first:end]) * each.probability for each in neighbors) for first, end in ranges]

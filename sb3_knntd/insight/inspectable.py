@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from sb3_knntd.insight.diagnosis import Diagnosis, diagnose
+from sb3_knntd.insight.diagnosis import TABLE_CHECKLIST, Checklist, Diagnosis, diagnose
 from sb3_knntd.insight.explanation import Explanation, explain
 from sb3_knntd.online_algorithm import OnlineAlgorithm
 from sb3_knntd.plots import Names
@@ -20,6 +20,8 @@ class Inspectable(OnlineAlgorithm):
     The parameters are those of SB3's BaseAlgorithm.
     """
 
+    #: what :meth:`diagnose` looks for
+    checklist: ClassVar[Checklist] = TABLE_CHECKLIST
     policy: KNNPolicy
     gamma: Any
     #: ε or the temperature at the last step

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from sb3_knntd.actions.peak import LEAST_CURVATURE, PeakSelector
 from sb3_knntd.common.files import replacing
 from sb3_knntd.insight.diagnosis import TrainedModel, diagnose
 from sb3_knntd.insight.labels import column_names
@@ -133,8 +134,10 @@ def page_content(
         "isWhole": not isinstance(model.observation_space, spaces.Box),
         "seen": [experience.low.tolist(), experience.high.tolist()] if experience.n_steps else None,
         "limit": FARTHEST,
+        "leastCurvature": LEAST_CURVATURE,
         "k": policy.n_neighbors,
         **_weights(policy),
+        "rules": _rules(policy),
         **_points(policy),
         **_table(policy),
         **_action_space(model),
@@ -169,6 +172,21 @@ def _weights(policy: KNNPolicy) -> dict[str, Any]:
     return {"weighting": weights.WEIGHTING.name.lower(), "bandwidth": weights.bandwidth}
 
 
+def _rules(policy: KNNPolicy) -> list[dict[str, Any]]:
+    """Where columns are forbidden; JSON has no infinity."""
+    rules = policy.rules
+    return [
+        {
+            "low": np.nan_to_num(low).tolist(),
+            "high": np.nan_to_num(high).tolist(),
+            "columns": np.flatnonzero(columns).tolist(),
+        }
+        for low, high, columns in zip(
+            *(part.cpu().numpy() for part in (rules.low, rules.high, rules.columns)), strict=True
+        )
+    ]
+
+
 def _points(policy: KNNPolicy) -> dict[str, Any]:
     points = policy.perceiver.points
     if points.n_points > LARGEST_INDEX:
@@ -200,6 +218,7 @@ def _table(policy: KNNPolicy) -> dict[str, Any]:
         "visits": _encoded(visits[told].astype(np.float64)),
         "initialValue": table.initial_value,
         "factors": policy.columns.factors.tolist(),
+        "averagesValues": policy.selector.averages_values,
     }
 
 
@@ -207,8 +226,10 @@ def _action_space(model: TrainedModel) -> dict[str, Any]:
     space = model.action_space
     if not isinstance(space, spaces.Box):
         return {"actionPoints": None}
+    selector = model.policy.selector
     return {
         "actionPoints": model.policy.columns.points.tolist(),
+        "sides": selector.sides.tolist() if isinstance(selector, PeakSelector) else None,
         "actionLow": space.low.reshape(-1).tolist(),
         "actionHigh": space.high.reshape(-1).tolist(),
         "actionIsWhole": bool(np.issubdtype(space.dtype, np.integer)),

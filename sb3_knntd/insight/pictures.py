@@ -63,8 +63,8 @@ def plot_explanation(
         fixed = {dim: float(observation[dim]) for dim in set(range(len(observation))) - set(dims)}
         for ax in plot_value_function(model, dims, fixed, axes=maps, names=names):
             _draw_neighbors(ax, observation, neighbors, dims)
-    # With continuous actions each neighbour chooses, and the mean values choose nothing.
-    chosen = int(q_values.argmax()) if isinstance(model.action_space, spaces.Discrete) else -1
+    # With Ex⟨a⟩ each neighbour chooses, and the mean values choose nothing.
+    chosen = int(q_values.argmax()) if model.policy.selector.averages_values else -1
     _draw_values(bars, q_values, neighbors, columns, chosen)
     bars.set_title(title, fontsize="medium")
     return tuple(axes)
@@ -100,11 +100,22 @@ def _draw_values(
     axes: Axes, values: np.ndarray, neighbors: Sequence[Neighbor], columns: Sequence[str], chosen: int
 ) -> None:
     places = np.arange(len(values))
-    axes.hlines(places, min(values.min(), *(each.values.min() for each in neighbors)), values, color="0.85")
+    # Forbidden actions have the value -inf, and are not drawn.
+    allowed = np.isfinite(values)
+    lowest = min(values[allowed].min(), *(each.values[allowed].min() for each in neighbors))
+    axes.hlines(places[allowed], lowest, values[allowed], color="0.85")
     for neighbor in neighbors:
         size = 24 * np.sqrt(neighbor.probability)
-        axes.plot(neighbor.values, places, "o", color=LINE_COLOR, alpha=0.35, markersize=size, markeredgewidth=0)
-    for place, value in enumerate(values):
+        axes.plot(
+            neighbor.values[allowed],
+            places[allowed],
+            "o",
+            color=LINE_COLOR,
+            alpha=0.35,
+            markersize=size,
+            markeredgewidth=0,
+        )
+    for place, value in zip(places[allowed], values[allowed], strict=True):
         color = BASELINE_COLOR if place == chosen else "0.35"
         axes.plot(value, place, "|", color=color, markersize=22, markeredgewidth=3)
     axes.set_yticks(places, list(columns))

@@ -159,6 +159,11 @@ class Planner(ABC):
     def known(self) -> np.ndarray:
         """Whether an action is known at a point, shape (n_points, n_actions), bool."""
 
+    @property
+    def error_share(self) -> float:
+        """How far the remembered steps are from the model, as a share of the changes in them; 0 if it counts them."""
+        return 0.0
+
     @abstractmethod
     def summary(self) -> dict[str, float]:
         """

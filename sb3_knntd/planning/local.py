@@ -24,6 +24,8 @@ FIRST_PLAN = 25
 #: An action is held until the state has moved by this many spacings, at most this many steps. What lies farther than
 #: this from all points, in spacings, is not known.
 MOVE, MOST_HELD, FAR = 1.5, 20, 1.5
+#: Where states change less in a step, scaled units, there is nothing to predict.
+LEAST_CHANGE = 1e-9
 #: Number of points whose outcomes are found anew in turn at each plan.
 TURN = 100
 #: Largest number of sweeps of a plan, and of weights read in them: the next plan goes on from there.
@@ -117,6 +119,16 @@ class LocalPlanner(Planner):
     @property
     def known(self) -> np.ndarray:
         return self.model.known
+
+    @property
+    def error_share(self) -> float:
+        known, n = self.known, self.buffer.n_transitions
+        if not known.any():
+            return 0.0
+        data = self.model.data
+        change = float(np.sqrt(((data.next_states[:n] - data.states[:n]) ** 2).mean()))
+        error = float(self.model.arrays.errors[: self.model.n_points][known].mean())
+        return error / change if change > LEAST_CHANGE else 0.0
 
     @property
     def optimistic(self) -> np.ndarray:  # type: ignore[override]
