@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from toy_envs import DriftEnv, PushEnv
 
-from sb3_knntd import KNNTD, ExA
+from sb3_knntd import KNNTD, ExA, KNNDyna
 from sb3_knntd.kernels import jit
 
 pytestmark = [
@@ -107,6 +107,16 @@ def test_actions_that_do_not_start_at_0_and_whole_ones(places: np.ndarray) -> No
         # Sums of float64 may differ in their last digit.
         np.testing.assert_allclose(actions.numpy(), expected, rtol=0.0, atol=1e-15)
         assert actions.numpy().dtype == expected.dtype
+
+
+def test_actions_between_action_points(places: np.ndarray) -> None:
+    model = KNNDyna(PushEnv(shape=(2,), dtype=np.float32), simulated_steps=10, seed=0).learn(200)
+    expected, _ = model.predict(places)
+    assert len(np.unique(expected)) > 3, "there must be other actions than action points"
+    actions = traced(model.policy, th.from_numpy(places[:3]))(th.from_numpy(places)).numpy()
+    assert actions.dtype == expected.dtype
+    np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-3)
+    assert (np.abs(actions - expected) < 1e-6).mean() > 0.99
 
 
 @pytest.mark.skipif(not jit.AVAILABLE, reason="hashed tables need numba")
