@@ -122,6 +122,16 @@ def test_actions_that_do_not_start_at_0_and_whole_ones(places: np.ndarray) -> No
         assert actions.numpy().dtype == expected.dtype
 
 
+def test_actions_between_action_points(places: np.ndarray) -> None:
+    model = KNNDyna(PushEnv(shape=(2,), dtype=np.float32), simulated_steps=10, seed=0).learn(200)
+    expected, _ = model.predict(places)
+    assert len(np.unique(expected)) > 3, "there must be other actions than action points"
+    actions = traced(model.policy, th.from_numpy(places[:3]))(th.from_numpy(places)).numpy()
+    assert actions.dtype == expected.dtype
+    np.testing.assert_allclose(actions, expected, rtol=0.0, atol=1e-3)
+    assert (np.abs(actions - expected) < 1e-6).mean() > 0.99
+
+
 @pytest.mark.skipif(not jit.AVAILABLE, reason="hashed tables need numba")
 @pytest.mark.parametrize("how", [traced, exported])
 def test_a_hashed_table_cannot_be_exported(how: Callable[..., Any]) -> None:
