@@ -434,7 +434,7 @@ def test_what_fails_in_planning_is_found(case: str) -> None:
     name, parameter, arguments = PLANNING_FAILURES[case]
     arguments = dict(arguments)
     env = arguments.pop("env", lambda: gym.make("Pendulum-v1"))()
-    model = KNNDyna(env, seed=0, simulated_steps=10, **arguments).learn(999)
+    model = KNNDyna(env, seed=0, simulated_steps=0, **arguments).learn(999)
     assert len(model.diagnose()) == 0
     assert "Too few steps for a diagnosis: it takes 1,000." in str(model.diagnose())
     diagnosis = model.learn(201, reset_num_timesteps=False).diagnose()
@@ -540,7 +540,7 @@ def test_the_page_computes_what_the_model_does(
     # What is drawn is tested below, and loading it takes seconds.
     monkeypatch.setattr("plotly.offline.get_plotlyjs", lambda: NO_PLOTLY)
     cls, env, arguments = MODELS[case]
-    model = cls(env, seed=0, **arguments).learn(1_000 if cls is KNNDyna else 2_500)
+    model = cls(env, seed=0, **arguments).learn(300 if cls is KNNDyna else 2_500)
     write_page(model, tmp_path / "page.html")
     page, _ = opened(browser, tmp_path / "page.html")
     if case == "states":
