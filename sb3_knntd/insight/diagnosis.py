@@ -221,7 +221,7 @@ def diagnose(model: TrainedModel, names: Names | None = None) -> Diagnosis:
     ``exploring``            ε is still above 0.1
     ======================== =========================================================================================
 
-    KNNDyna is checked for what hinders a model and planning, see :data:`sb3_knntd.planning.diagnosis.CHECKLIST`.
+    KNNDyna is checked for what hinders a model and planning instead.
 
     :param model: the model
     :param names: names of the dimensions and actions; by default those of the environment, or numbers
