@@ -275,7 +275,7 @@ def test_forbidden_actions_are_never_taken(algorithm: type[Model], arguments: di
 
 
 @pytest.mark.parametrize(("env_id", "action"), [("MountainCar-v0", 2), ("MountainCarContinuous-v0", {0: (0.5, 1.0)})])
-def test_forbidden_actions_are_never_planned(env_id: str, action: Any, tmp_path: pathlib.Path) -> None:
+def test_a_planner_never_takes_forbidden_actions(env_id: str, action: Any, tmp_path: pathlib.Path) -> None:
     model = KNNDyna(env_id, seed=0, action_points=5, simulated_steps=10)
     model.policy.forbid(action, {0: (-np.inf, -0.5)})
     taken = Taken()

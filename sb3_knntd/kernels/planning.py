@@ -76,12 +76,6 @@ class PlanConfig(NamedTuple):
 
 
 @jit
-def learned_reward(observation, action, next_observation):
-    """Stand in for a reward function where the reward is learned: NaN."""
-    return np.nan
-
-
-@jit
 def gaussian_neighbors(state, points, n_points, bandwidth, indices, weights):
     """
     Find the nearest points and weigh them.
@@ -135,9 +129,10 @@ def _advance(state, point, action, model, config, reward_function, outputs, plac
         state[j] = min(max(state[j] + outputs[j], config.low[j]), config.high[j])
         places[1, j] = config.offset[j] + config.unit[j] * (state[j] + 1.0)
     end = model.ends[point, action]
-    reward = reward_function(places[0], config.actions[action], places[1])
-    if np.isnan(reward):
+    if reward_function is None:
         reward = (1.0 - end) * outputs[obs_dim] + end * model.end_rewards[point, action]
+    else:
+        reward = reward_function(places[0], config.actions[action], places[1])
     return reward, end
 
 
@@ -177,7 +172,7 @@ def make_outcome(point, action, n_points, model, outcomes, config, reward_functi
     :param model: see :class:`~sb3_knntd.kernels.local_model.ModelArrays`
     :param outcomes: see :class:`OutcomeArrays`
     :param config: see :class:`PlanConfig`
-    :param reward_function: compiled, see :func:`learned_reward`
+    :param reward_function: compiled, from :func:`~sb3_knntd.model.rewards.compiled_reward`; ``None`` if it is learned
     :param state: work space, shape (obs_dim,)
     :param outputs: work space, shape (obs_dim + 1,)
     :param places: work space, shape (2, obs_dim)
@@ -210,7 +205,7 @@ def refresh_outcomes(n_points, n_others, first, model, outcomes, config, reward_
     :param model: see :class:`~sb3_knntd.kernels.local_model.ModelArrays`
     :param outcomes: see :class:`OutcomeArrays`
     :param config: see :class:`PlanConfig`
-    :param reward_function: compiled, see :func:`learned_reward`
+    :param reward_function: compiled, from :func:`~sb3_knntd.model.rewards.compiled_reward`; ``None`` if it is learned
     :return: the point to begin with the next time
     """
     obs_dim = model.points.shape[1]
@@ -402,7 +397,7 @@ def simulate(
     :param model: see :class:`~sb3_knntd.kernels.local_model.ModelArrays`
     :param config: see :class:`PlanConfig`
     :param simulation: see :class:`SimulationConfig`
-    :param reward_function: compiled, see :func:`learned_reward`
+    :param reward_function: compiled, from :func:`~sb3_knntd.model.rewards.compiled_reward`; ``None`` if it is learned
     :param random_state: shape (1,), uint64
     :param k: number of neighbours with which the table is read
     """

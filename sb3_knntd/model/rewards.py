@@ -9,7 +9,6 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_knntd.kernels import jit
-from sb3_knntd.kernels.planning import learned_reward
 
 
 def compiled_reward(
@@ -22,11 +21,12 @@ def compiled_reward(
     :param function: the function, or one that numba has compiled; ``None`` if the reward is learned
     :param observation_space: Box
     :param action_space: Box or Discrete
-    :return: a compiled function of three arrays, in which a Discrete action is an array of one number
+    :return: a compiled function of three arrays, in which a Discrete action is an array of one number; ``None`` if the
+        reward is learned
     :raises ValueError: if numba cannot compile the function, or it does not return a finite number
     """
     if function is None:
-        return learned_reward
+        return None
     if not callable(function):
         raise ValueError(
             "reward_function must be a function of (observation, action, next_observation), or None; got "

@@ -65,7 +65,7 @@ class LocalPlanner(Planner):
     :param buffer: the transitions
     :param action_points: see :class:`~sb3_knntd.model.LocalModel`
     :param settings: parameters of planning
-    :param reward_function: compiled, from :func:`~sb3_knntd.model.rewards.compiled_reward`
+    :param reward_function: compiled, from :func:`~sb3_knntd.model.rewards.compiled_reward`; ``None`` if it is learned
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class LocalPlanner(Planner):
         buffer: TransitionBuffer,
         action_points: np.ndarray,
         settings: PlanSettings,
-        reward_function: Any = kernels.learned_reward,
+        reward_function: Any = None,
     ) -> None:
         super().__init__(settings)
         self._reward_function = reward_function
@@ -146,8 +146,8 @@ class LocalPlanner(Planner):
     ) -> None:
         if self.buffer.is_full:
             self.model.make_room()
-        given = self._reward_function(observation, self._in_units(action), next_observation)
-        reward = reward if np.isnan(given) else float(given)
+        if self._reward_function is not None:
+            reward = float(self._reward_function(observation, self._in_units(action), next_observation))
         self.rewards.add(reward, terminated)
         transition = self.buffer.add(observation, action, reward, next_observation, terminated)
         if not self.model.n_points:
@@ -325,8 +325,10 @@ class LocalPlanner(Planner):
         if not self.model.n_points:
             raise ValueError("the model has learned nothing yet: call learn first")
         prediction = self.model.predict(observation, action)
-        reward = self._reward_function(observation, self._in_units(action), prediction.observation)
-        return prediction if np.isnan(reward) else prediction._replace(reward=float(reward))
+        if self._reward_function is None:
+            return prediction
+        reward = float(self._reward_function(observation, self._in_units(action), prediction.observation))
+        return prediction._replace(reward=reward)
 
     # ------------------------------------------------------- logging, saving
 
