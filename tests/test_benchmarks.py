@@ -326,6 +326,18 @@ def test_planning_cost_refuses_sizes_that_overlap(
     assert "[10000, 11000]" in capsys.readouterr().err
 
 
+def test_the_tank_is_held_by_the_pi_controller(
+    benchmarks: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tank = benchmarks("tank")
+    monkeypatch.setattr(tank, "EPISODES", 2)
+    monkeypatch.setattr(sys, "argv", ["tank", "--seeds", "1", "--steps", "60"])
+    tank.main()
+    rows = [line.split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert [row[1].strip() for row in rows] == ["controller", "PI", "KNNDyna, seed 100", "KNNDyna, median"]
+    assert float(rows[1][3]) < 0.5 < float(rows[2][3])
+
+
 def test_the_zoo_benchmark_trains_as_the_command_does(
     benchmarks: Any, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
