@@ -34,7 +34,8 @@ nitpick_ignore_regex = [
     # Names imported only for type checking, type variables and type aliases.
     (r"py:.*", r"Axes|BaseCallback|Figure|Path|VecEnv|GymEnv|MaybeCallback|Schedule|State|Target"),
     (r"py:.*", r"(sb3_knntd\..*\.)?(Self\w+|Function)"),
-    (r"py:.*", r"ActionColumns|Exploration|RandomStream"),
+    (r"py:.*", r"ActionColumns|Exploration|RandomStream|VectorEnv"),
+    (r"py:.*", r"(sb3_knntd\..*\.)?(Checklist|PlanningModel|Rules|SpacedPolicy|VisitedBounds)"),
 ]
 
 myst_enable_extensions = ["colon_fence", "deflist"]

@@ -21,7 +21,7 @@ State = tuple[float, ...]
 
 class PaperEnv(gym.Env[npt.NDArray[np.float32], ActionT], Generic[ActionT], ABC):
     """
-    An environment whose state is a tuple of floats and whose observation is that state, or what :meth:`_exact` makes
+    An environment whose state is a tuple of floats and whose observation is that state, or what ``_exact`` makes
     of it, optionally with noise.
 
     The noise is Gaussian and drawn independently for each observation from the environment's own generator. It affects

@@ -65,7 +65,7 @@ class LocalPlanner(Planner):
     :param buffer: the transitions
     :param action_points: see :class:`~sb3_knntd.model.LocalModel`
     :param settings: parameters of planning
-    :param reward_function: compiled, from :func:`~sb3_knntd.model.rewards.compiled_reward`; ``None`` if it is learned
+    :param reward_function: compiled, from ``model.rewards.compiled_reward``; ``None`` if it is learned
     """
 
     def __init__(

@@ -31,7 +31,7 @@ class EnvPoolVecEnv(BatchedVecEnv):
 
     EnvPool resets an environment one step after its episode ended. Here the next episode begins in the same step, as in
     SB3's DummyVecEnv: in a spare environment that has been reset, while the other one is reset in the next step. There
-    is a spare one for every four environments. After :meth:`seed`, the next :meth:`reset` makes the environments anew,
+    is a spare one for every four environments. After ``seed``, the next :meth:`reset` makes the environments anew,
     since EnvPool takes seeds only then.
 
     :param env_id: EnvPool's name of the environment; ``envpool.list_all_envs()`` has all of them
