@@ -479,7 +479,15 @@ def test_a_file_that_was_compressed_is_read(make_model: MakeModel, tmp_path: pat
 # -------------------------------------------------------------------------------------------------- invalid states
 
 
-@pytest.mark.parametrize("kind", ["dense", "hashed", "adaptive", "torch"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "dense",
+        "hashed",
+        pytest.param("adaptive", marks=pytest.mark.slow),
+        pytest.param("torch", marks=pytest.mark.slow),
+    ],
+)
 def test_a_modified_state_is_loaded_or_refused(tmp_path: pathlib.Path, kind: str) -> None:
     fuzz = pathlib.Path(__file__).with_name("fuzz_states.py")
     command = [sys.executable, str(fuzz), kind, str(tmp_path)]
