@@ -18,9 +18,7 @@ from sb3_knntd.base import KNNAlgorithm
 from sb3_knntd.common.checks import check_integer, check_number
 from sb3_knntd.common.hyperparameters import FixedHyperparameter, Hyperparameter
 from sb3_knntd.common.schedules import make_schedule
-from sb3_knntd.datasets import record
 from sb3_knntd.dyna_policies import BANDWIDTH, DynaBoxPolicy, DynaPolicy, policy_for
-from sb3_knntd.editing import actions_of
 from sb3_knntd.insight.diagnosis import Checklist
 from sb3_knntd.kernels.selection import Target
 from sb3_knntd.learners import Learner, Transitions
@@ -224,12 +222,9 @@ class KNNDyna(KNNAlgorithm):
             if self.reward_function is not None:
                 raise ValueError("reward_function needs a Box of observations; with counted states the reward is exact")
             return StatePlanner(policy, settings)
-        points = policy.columns.points
-        action_points = np.empty((len(points), 0))
-        if points.shape[1]:
-            low, high = points.min(axis=0), points.max(axis=0)
-            action_points = 2.0 * (points - low) / np.maximum(high - low, 1e-300) - 1.0
-        buffer = TransitionBuffer(int(self.buffer_size), policy.perceiver.bounds.obs_dim, max(points.shape[1], 1))
+        columns = policy.columns
+        action_points = columns.scale(columns.points) if columns.lists else columns.points
+        buffer = TransitionBuffer(int(self.buffer_size), policy.perceiver.bounds.obs_dim, max(len(columns.lists), 1))
         assert isinstance(policy, (DynaPolicy, DynaBoxPolicy))
         reward_function = compiled_reward(self.reward_function, self.observation_space, self.action_space)
         return LocalPlanner(policy, buffer, action_points, settings, reward_function)
@@ -324,16 +319,8 @@ class KNNDyna(KNNAlgorithm):
         :return: the model
         :raises ValueError: if an argument is invalid, or the controller returns no action of the action space
         """
-        act, n_steps = actions_of(controller), check_integer("n_steps", n_steps, 1)
-        if self.env is None:
-            raise ValueError("there is no environment to run the controller in: call set_env(env) first")
-        # The environments are no longer where they were.
-        self._last_obs = None
-        self._abandon_episodes()
-        transitions, mean_return = record(self.env, act, n_steps)
+        transitions = self._run(controller, n_steps)
         self._learn_offline(transitions, 1)
-        if self.verbose >= 1:
-            print(f"The controller's mean return over {n_steps} steps: {mean_return:.4g}")
         return self
 
     def refine(self: SelfKNNDyna, points: Any = None, bounds: Any = None) -> SelfKNNDyna:

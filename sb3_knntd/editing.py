@@ -138,8 +138,8 @@ class TableEditing:
 
     def forbid(self, action: Any, region: Any) -> None:
         """
-        Forbid actions in a region. There they are neither taken nor explored, nor do their values count. The rule is
-        saved with the policy, and does not depend on the points.
+        Forbid actions in a region. There they are neither taken nor explored, nor do their values count; KNNDyna's
+        plan does not know of it. The rule is saved with the policy, and does not depend on the points.
 
         :param action: Discrete actions: one or a list of them. Box actions: the action points in a box, a dict of
             components and their (low, high), or a pair (low, high) of arrays; the action is then the mean of others

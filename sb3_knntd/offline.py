@@ -101,23 +101,27 @@ class OfflineLearning(SavedAlgorithm):
         :return: the model
         :raises ValueError: if an argument is invalid, or the controller returns no action of the action space
         """
-        act, n_steps = actions_of(controller), check_integer("n_steps", n_steps, 1)
         if margin is not None:
             check_number("margin", margin, 0.0, LARGEST_VALUE, above=True)
-        if self.env is None:
-            raise ValueError("there is no environment to run the controller in: call set_env(env) first")
-        # The environments are no longer where they were.
-        self._last_obs = None
-        self._abandon_episodes()
-        transitions, mean_return = record(self.env, act, n_steps)
+        transitions = self._run(controller, n_steps)
         self._learn_offline(transitions, 10)
         self.policy.imitate(controller, margin)
         self.learning_rate = CAREFUL_LEARNING_RATE
         self.exploration_initial_eps = min(self.exploration_initial_eps, CAREFUL_EPSILON)
         self.exploration_final_eps = min(self.exploration_final_eps, CAREFUL_EPSILON)
+        return self
+
+    def _run(self, controller: Any, n_steps: int) -> Transitions:
+        """Run a controller in the environments, which then are no longer where they were."""
+        act, n_steps = actions_of(controller), check_integer("n_steps", n_steps, 1)
+        if self.env is None:
+            raise ValueError("there is no environment to run the controller in: call set_env(env) first")
+        self._last_obs = None
+        self._abandon_episodes()
+        transitions, mean_return = record(self.env, act, n_steps)
         if self.verbose >= 1:
             print(f"The controller's mean return over {n_steps} steps: {mean_return:.4g}")
-        return self
+        return transitions
 
     def refine(self: SelfOfflineLearning, points: Any = None, bounds: Any = None) -> SelfOfflineLearning:
         """

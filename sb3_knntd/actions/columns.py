@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import product
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +31,44 @@ class ActionColumns(NamedTuple):
     points: np.ndarray
     factors: np.ndarray
     lists: list[np.ndarray]
+
+    def nearest(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: shape (n, action_dim), action units
+        :return: the columns of the nearest action points, one for each action factor, shape (n, n_factors), int64
+        :raises ValueError: if the shape is wrong, or an action is not finite
+        """
+        vectors, action_dim = np.asarray(actions, dtype=np.float64), self.points.shape[1]
+        if vectors.ndim != 2 or vectors.shape[1] != action_dim or not np.isfinite(vectors).all():
+            raise ValueError(f"actions must be finite and of shape (n, {action_dim}); got shape {vectors.shape}")
+        found = []
+        for factor, (first, end) in enumerate(pairwise(self.factors.tolist())):
+            # A factored table has a factor for each dimension of the action.
+            dims = slice(None) if len(self.factors) == 2 else slice(factor, factor + 1)
+            distances = (vectors[:, None, dims] - self.points[None, first:end, dims]) ** 2
+            found.append(first + distances.sum(axis=2).argmin(axis=1))
+        return np.stack(found, axis=1).astype(np.int64)
+
+    def scale(self, actions: np.ndarray) -> np.ndarray:
+        """
+        :param actions: shape (..., action_dim), action units
+        :return: the same with the range of the action points as [-1, 1]; 0 in dimensions of one action point
+        """
+        low, width = self._range()
+        return np.where(width > 0.0, 2.0 * (actions - low) / np.where(width > 0.0, width, 1.0) - 1.0, 0.0)
+
+    def unscale(self, scaled: np.ndarray) -> np.ndarray:
+        """
+        :param scaled: shape (..., action_dim), the range of the action points is [-1, 1]
+        :return: the same in action units
+        """
+        low, width = self._range()
+        actions: np.ndarray = low + 0.5 * (scaled + 1.0) * width
+        return actions
+
+    def _range(self) -> tuple[np.ndarray, np.ndarray]:
+        low = np.array([points[0] for points in self.lists])
+        return low, np.array([points[-1] for points in self.lists]) - low
 
 
 def discrete_columns(n_actions: int) -> ActionColumns:

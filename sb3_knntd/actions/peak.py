@@ -90,16 +90,4 @@ class PeakSelector(MeanValueSelector):
         return self._points.to(probabilities.device)[action_indices[:, 0, 0]]
 
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
-        given = np.asarray(actions, dtype=np.float64)
-        action_dim = self.columns.points.shape[1]
-        if given.ndim != 2 or given.shape[1] != action_dim:
-            raise ValueError(f"actions must have shape (n, {action_dim}); got {given.shape}")
-        if not np.isfinite(given).all():
-            raise ValueError("actions must be finite; got NaN or infinity in them")
-        shape = [len(points) for points in self.columns.lists]
-        nearest = [
-            np.abs(given[:, dimension, None] - points).argmin(axis=1)
-            for dimension, points in enumerate(self.columns.lists)
-        ]
-        columns: np.ndarray = np.ravel_multi_index(nearest, shape)[:, None].astype(np.int64)
-        return columns
+        return self.columns.nearest(actions)

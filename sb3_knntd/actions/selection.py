@@ -409,16 +409,7 @@ class MeanActionSelector(ActionSelector):
         return (probabilities[..., None] * points).cumsum(dim=1)[:, -1]
 
     def columns_of(self, actions: np.ndarray) -> np.ndarray:
-        vectors, points = np.asarray(actions, dtype=np.float64), self.columns.points
-        if vectors.ndim != 2 or vectors.shape[1] != points.shape[1] or not np.isfinite(vectors).all():
-            raise ValueError(f"actions must be finite and of shape (n, {points.shape[1]}); got shape {vectors.shape}")
-        nearest = []
-        for factor, (first, end) in enumerate(self.factor_ranges):
-            # A factored table has a factor for each dimension of the action.
-            dims = slice(None) if self.n_factors == 1 else slice(factor, factor + 1)
-            distances = (vectors[:, None, dims] - points[None, first:end, dims]) ** 2
-            nearest.append(first + distances.sum(axis=2).argmin(axis=1))
-        return np.stack(nearest, axis=1).astype(np.int64)
+        return self.columns.nearest(actions)
 
     def value(
         self,

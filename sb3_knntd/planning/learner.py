@@ -47,10 +47,6 @@ class DynaLearner(Learner):
         self.policy, self.planner, self._stream = policy, planner, stream
         obs_dim = policy.perceiver.bounds.obs_dim
         self._is_box = policy.columns.points.shape[1] > 0
-        if self._is_box:
-            lists = policy.columns.lists
-            self._action_middle = np.array([0.5 * (points[0] + points[-1]) for points in lists])
-            self._action_reach = np.array([max(0.5 * (points[-1] - points[0]), 1e-300) for points in lists])
         self._observations = np.zeros((n_envs, obs_dim))
         self._columns = np.zeros(n_envs, np.int64)
         self._vectors = np.zeros((n_envs, policy.columns.points.shape[1]))
@@ -70,10 +66,7 @@ class DynaLearner(Learner):
         :param actions: columns, shape (n,), or vectors, shape (n, action_dim), action units
         :return: as planners take them: from -1 to 1, shape (n, action_dim), or columns, shape (n, 1)
         """
-        if not self._is_box:
-            return actions.reshape(-1, 1)
-        scaled: np.ndarray = (actions - self._action_middle) / self._action_reach
-        return scaled
+        return self.policy.columns.scale(actions) if self._is_box else actions.reshape(-1, 1)
 
     # ---------------------------------------------------------------- learning
 
@@ -237,17 +230,21 @@ class DynaLearner(Learner):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
-        n_actions = self.table.n_actions
         since_plan = checked_integer(state_dict, "since_plan", 0, 2**62)
         self.planner.load_state_dict(entry(state_dict, "planner"))
         self._since_plan = since_plan
         same = getattr(entry(state_dict, "observations"), "shape", (0,))[:1] == (self.n_envs,)
         self.in_episodes = bool(checked_integer(state_dict, "in_episodes", 0, 1)) and same
-        if not self.in_episodes:
-            return
+        if self.in_episodes:
+            self._take_over(state_dict)
+
+    def _forget(self) -> None:
+        """Nothing: there are no traces."""
+
+    def _take_over(self, state_dict: dict[str, Any]) -> None:
         n = (self.n_envs,)
         observations = checked_tensor(state_dict, "observations", self._observations.shape, th.float64)
-        columns = checked_tensor(state_dict, "columns", n, th.int64, 0, n_actions - 1)
+        columns = checked_tensor(state_dict, "columns", n, th.int64, 0, self.table.n_actions - 1)
         vectors = checked_tensor(state_dict, "vectors", self._vectors.shape, th.float64)
         explores = checked_tensor(state_dict, "explores", n, th.bool)
         rest = checked_tensor(state_dict, "rest", n, th.int64)
@@ -258,12 +255,6 @@ class DynaLearner(Learner):
         ):
             array[:] = tensor.numpy()
         self.rules_version = self.selector.rules.version
-
-    def _forget(self) -> None:
-        """Nothing: there are no traces."""
-
-    def _take_over(self, state_dict: dict[str, Any]) -> None:
-        raise NotImplementedError
 
 
 def pick_best(values: np.ndarray, uniforms: np.ndarray) -> np.ndarray:

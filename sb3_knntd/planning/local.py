@@ -160,12 +160,9 @@ class LocalPlanner(Planner):
 
     def _in_units(self, action: np.ndarray) -> np.ndarray:
         """An action as reward functions take it."""
-        if not self.policy.columns.points.shape[1]:
-            in_units: np.ndarray = self._actions[int(action[0])]
-            return in_units
-        low, high = self._actions.min(axis=0), self._actions.max(axis=0)
-        scaled: np.ndarray = low + 0.5 * (action + 1.0) * (high - low)
-        return scaled
+        columns = self.policy.columns
+        in_units: np.ndarray = columns.unscale(action) if columns.lists else self._actions[int(action[0])]
+        return in_units
 
     def _visit(self, state: np.ndarray) -> None:
         """Count a step at the nearest point."""

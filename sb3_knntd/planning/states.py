@@ -89,12 +89,8 @@ class StatePlanner(Planner):
         self._counts[(*at, places[0])] += 1.0
 
     def _column(self, action: np.ndarray) -> int:
-        points = self.policy.columns.points
-        if not points.shape[1]:
-            return int(action[0])
-        low, high = points.min(axis=0), points.max(axis=0)
-        scaled = 2.0 * (points - low) / np.maximum(high - low, 1e-300) - 1.0
-        return int(((scaled - action) ** 2).sum(axis=1).argmin())
+        columns = self.policy.columns
+        return int(columns.nearest(columns.unscale(action[None]))[0, 0]) if columns.lists else int(action[0])
 
     def plan(self, n_steps: int, seed: int) -> None:
         if not self.n_transitions:
